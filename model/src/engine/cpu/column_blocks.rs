@@ -91,18 +91,22 @@ impl<V: DerefMut<Target = [f32]>> ColumnBlocks<V> {
         self.values.par_chunks_exact_mut(len)
     }
 
-    /// Row `y` of one plane in one block, [part, column of the block].
-    #[inline(always)]
-    pub(super) fn row_of_block(&self, block: usize, plane: usize, y: usize) -> &[f32] {
-        let row_len = self.parts * self.lanes;
-        &self.values[block * self.block_len() + plane * self.plane_len() + y * row_len..][..row_len]
+    /// Values of a row of a plane in one block.
+    pub(super) fn row_len(&self) -> usize {
+        self.parts * self.lanes
+    }
+
+    /// The rows from row `y` on of one plane in one block, [row, part, column of the block].
+    pub(super) fn rows_of_block(&self, block: usize, plane: usize, y: usize) -> &[f32] {
+        let (plane_len, first) = (self.plane_len(), y * self.row_len());
+        &self.values[block * self.block_len() + plane * plane_len..][..plane_len][first..]
     }
 
     /// Row `y` of one complex plane.
     pub(super) fn row_of_cells(&self, plane: usize, y: usize) -> impl Iterator<Item = Complex32> {
         assert_eq!(self.parts, 2);
         let cells = (0..self.size.width.div_ceil(self.lanes)).flat_map(move |block| {
-            let (re, im) = self.row_of_block(block, plane, y).split_at(self.lanes);
+            let (re, im) = self.rows_of_block(block, plane, y)[..self.row_len()].split_at(self.lanes);
             re.iter().zip(im).map(|(re, im)| Complex32::new(*re, *im))
         });
         cells.take(self.size.width)

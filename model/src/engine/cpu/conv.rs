@@ -383,7 +383,11 @@ impl TileRow<'_> {
         if S::INTEGERS {
             let largest = shape.largest_input() / (POINTS_GAIN * POINTS_GAIN);
             for (tile, scales) in scales.iter_mut().enumerate().take(tiles) {
-                *scales = integers_scale(simd, &magnitudes[tile * TILE * S::LANES..][..POINTS * S::LANES], largest);
+                let mut magnitude = simd.splat(0.0);
+                for pixel in magnitudes.chunks_exact(S::LANES).skip(tile * TILE).take(POINTS) {
+                    magnitude = simd.larger_magnitude(magnitude, simd.read(pixel));
+                }
+                *scales = integers_scale(simd, magnitude, largest);
             }
         }
         scales

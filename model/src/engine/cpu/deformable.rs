@@ -2,7 +2,7 @@
 
 use super::conv::{Activation, Epilogue, PlainConv, TAPS, WorkerScratch};
 use super::feature_map::{FeatureMap, TILE};
-use super::product::{ROWS, Shape, integers_scale, panel_place, panels_len};
+use super::product::{PANEL, ROWS, Shape, integers_scale, panel_place, panels_len};
 use super::workers::WORKERS;
 use crate::simd::{Products, Simd, Task};
 use crate::weights::OFFSET_CHANNELS;
@@ -21,12 +21,19 @@ pub(super) struct DeformableConv {
     workers: Vec<Scratch>,
 }
 
-/// What one worker makes of a row of tiles, [`ROWS`] pixels at a time.
+/// What one worker makes of a row of tiles.
 struct Scratch {
     offset_conv: WorkerScratch,
     /// Rows of offsets with their borders.
     offsets: Vec<f32>,
-    /// The panels of what the pixels read at each tap, and those of their sums.
+    pixels: Pixels,
+}
+
+/// What it makes of [`ROWS`] pixels at a time.
+struct Pixels {
+    /// Where they read.
+    places: Vec<Places>,
+    /// The panels of what they read at each tap, and those of their sums.
     taps: Vec<f32>,
     sums: Vec<f32>,
     /// What a pixel reads at each tap [tap, channel], before it is integers.
@@ -81,7 +88,7 @@ impl DeformableConv {
         debug_assert_eq!((input.stride, output.stride), (*in_stride, *out_stride));
         let row_len = output.row_len;
         output.for_each_tile_row(workers, |scratch, first, rows| {
-            let Scratch { offset_conv: offset_scratch, offsets, taps, sums, values } = scratch;
+            let Scratch { offset_conv: offset_scratch, offsets, pixels } = scratch;
             let (offsets_stride, offsets_row_len) = (offset_conv.out_stride(), offsets.len() / TILE);
             let offsets = &mut offsets[..rows.len() / row_len * offsets_row_len];
             offset_conv.run_tile_row(input, first, offset_scratch, offsets, offsets_row_len);
@@ -89,19 +96,7 @@ impl DeformableConv {
             for (y, (output_row, offsets)) in (first..).zip(rows) {
                 let offsets = &offsets[offsets_stride..];
                 let shape = *shape;
-                products.run(Row {
-                    shape,
-                    weights,
-                    activation,
-                    input,
-                    offsets,
-                    offsets_stride,
-                    y,
-                    taps,
-                    sums,
-                    values,
-                    output_row,
-                });
+                products.run(Row { shape, weights, activation, input, offsets, offsets_stride, y, pixels, output_row });
             }
         });
     }
@@ -114,9 +109,12 @@ impl Scratch {
         Self {
             offset_conv: scratch,
             offsets: vec![0.0; TILE * (width + 2) * offset_conv.out_stride()],
-            taps: vec![0.0; shape.inputs_len()],
-            sums: vec![0.0; shape.outputs_len()],
-            values: vec![0.0; TAPS * in_stride],
+            pixels: Pixels {
+                places: vec![Places::default(); ROWS],
+                taps: vec![0.0; shape.inputs_len()],
+                sums: vec![0.0; shape.outputs_len()],
+                values: vec![0.0; TAPS * in_stride],
+            },
         }
     }
 }
@@ -131,9 +129,7 @@ struct Row<'a> {
     offsets: &'a [f32],
     offsets_stride: usize,
     y: usize,
-    taps: &'a mut [f32],
-    sums: &'a mut [f32],
-    values: &'a mut [f32],
+    pixels: &'a mut Pixels,
     /// With its border.
     output_row: &'a mut [f32],
 }
@@ -141,26 +137,24 @@ struct Row<'a> {
 impl Task for Row<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Self { shape, weights, activation, input, offsets, offsets_stride, y, taps, sums, values, output_row } =
-            self;
+        let Self { shape, weights, activation, input, offsets, offsets_stride, y, pixels, output_row } = self;
+        let Pixels { places, taps, sums, values } = pixels;
         let out_stride = activation.bias.len();
-        let group_len = shape.inputs_len() / TAPS;
-        assert!(group_len * S::FACTORS >= panels_len(input.stride) && out_stride.is_multiple_of(S::LANES));
-        assert!(values.len() == TAPS * input.stride);
+        assert!(out_stride.is_multiple_of(S::LANES));
         for x in (0..input.width).step_by(ROWS) {
             let pixels = (input.width - x).min(ROWS);
             // What each pixel's sums are multiplied by where they are of integers.
             let mut scales = [1.0; ROWS];
-            for (index, x) in (x..x + pixels).enumerate() {
-                let offsets = &offsets[x * offsets_stride..][..OFFSET_CHANNELS];
-                let both = taps.chunks_exact_mut(group_len).zip(values.chunks_exact_mut(input.stride));
-                for (k, (panels, values)) in both.enumerate() {
-                    let tap_y = (y + k / 3) as f32 - 1.0 + offsets[2 * k];
-                    let tap_x = (x + k % 3) as f32 - 1.0 + offsets[2 * k + 1];
-                    sample(simd, input, tap_x, tap_y, index, panels, values);
-                }
+            let offsets = offsets[x * offsets_stride..].chunks_exact(offsets_stride).take(pixels);
+            for ((x, offsets), places) in (x..).zip(offsets).zip(places.iter_mut()) {
+                places.set(simd, input, [x, y], offsets);
+            }
+            for (index, places) in places.iter().enumerate().take(pixels) {
+                let magnitudes = sample(simd, input, places, index, taps, values);
                 if S::INTEGERS {
-                    scales[index] = store_integers(simd, shape, values, index, taps);
+                    let [scale, sums_scale] = integers_scale(simd, magnitudes, shape.largest_input());
+                    scales[index] = sums_scale;
+                    store_integers(simd, scale, values, index, taps);
                 }
             }
             shape.multiply(simd, pixels, taps, weights, sums);
@@ -179,66 +173,152 @@ impl Task for Row<'_> {
     }
 }
 
-/// Reads `map` at (x, y) by bilinear interpolation, zero outside, into `row` of panels, or into `values` where factors
-/// are integers, whose scale is not known yet.
-#[inline(always)]
-fn sample<S: Simd>(simd: S, map: &FeatureMap, x: f32, y: f32, row: usize, panels: &mut [f32], values: &mut [f32]) {
-    let (width, height) = (map.width as f32, map.height as f32);
-    assert!(panels.len() * S::FACTORS >= panels_len(map.stride) && row < ROWS && map.stride.is_multiple_of(S::LANES));
-    assert!(values.len() == map.stride);
-    // NaN is outside too.
-    if !(x > -1.0 && x < width && y > -1.0 && y < height) {
-        values.fill(0.0);
-        for channel in (0..map.stride).step_by(S::LANES) {
-            panels[panel_place(row, channel) / S::FACTORS..][..S::LANES / S::FACTORS].fill(0.0);
+/// Where the taps of a pixel are read: each between four pixels of a map, counted with its border.
+#[derive(Clone, Default)]
+struct Places {
+    /// Row and column of the upper left one.
+    corners: [[i32; MOST_TAPS]; 2],
+    /// What the upper left one, the upper right one and the lower ones are worth.
+    shares: [[f32; MOST_TAPS]; 4],
+}
+
+/// [`TAPS`] in whole vectors.
+const MOST_TAPS: usize = TAPS.next_power_of_two();
+/// Where the kernel has its taps, from the pixel on.
+const ROW_OF: [f32; MOST_TAPS] = [-1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+const COLUMN_OF: [f32; MOST_TAPS] = [-1.0, 0.0, 1.0, -1.0, 0.0, 1.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+
+impl Places {
+    /// Those of pixel (x, y), given dy and dx of each tap in whole vectors.
+    #[inline(always)]
+    fn set<S: Simd>(&mut self, simd: S, map: &FeatureMap, [x, y]: [usize; 2], offsets: &[f32]) {
+        let (width, height) = (map.width as f32, map.height as f32);
+        // Four pixels of the border: the last one of the row above the first one, the first one of the next row, and
+        // those below.
+        let outside = [0, (map.row_len / map.stride - 1) as i32];
+        let mut offsets_of = [[0.0; MOST_TAPS]; 2];
+        for first in (0..MOST_TAPS).step_by(S::LANES) {
+            let vector = |at: usize| if at < offsets.len() { simd.read(&offsets[at..]) } else { simd.splat(f32::NAN) };
+            let [y, x] = simd.unzip(vector(2 * first), vector(2 * first + S::LANES));
+            simd.write(&mut offsets_of[0][first..], y);
+            simd.write(&mut offsets_of[1][first..], x);
         }
-        return;
+        let Self { corners, shares } = self;
+        for k in 0..MOST_TAPS {
+            let y = y as f32 + ROW_OF[k] + offsets_of[0][k];
+            let x = x as f32 + COLUMN_OF[k] + offsets_of[1][k];
+            // NaN is outside too.
+            let inside = (x > -1.0) & (x < width) & (y > -1.0) & (y < height);
+            let (top, left) = (if inside { y.floor() } else { 0.0 }, if inside { x.floor() } else { 0.0 });
+            let (lower, right) = (if inside { y - top } else { 0.0 }, if inside { x - left } else { 0.0 });
+            // SAFETY: both are whole numbers from −1 to the side of a map.
+            let corner = unsafe { [top.to_int_unchecked::<i32>() + 1, left.to_int_unchecked::<i32>() + 1] };
+            for (corners, (corner, outside)) in corners.iter_mut().zip(corner.into_iter().zip(outside)) {
+                corners[k] = if inside { corner } else { outside };
+            }
+            shares[0][k] = (1.0 - lower) * (1.0 - right);
+            shares[1][k] = (1.0 - lower) * right;
+            shares[2][k] = lower * (1.0 - right);
+            shares[3][k] = lower * right;
+        }
     }
-    let (left, top) = (x.floor(), y.floor());
-    let (right_share, lower_share) = (x - left, y - top);
-    // The border makes all four neighbours readable: left + 1 is in 0..=width.
-    let rows = &map.rows_from_above((top + 1.0) as usize)[(left + 1.0) as usize * map.stride..];
-    let (upper, lower) = (&rows[..2 * map.stride], &rows[map.row_len..][..2 * map.stride]);
-    let share = |value: f32| simd.splat(value);
-    let shares = [
-        share((1.0 - lower_share) * (1.0 - right_share)),
-        share((1.0 - lower_share) * right_share),
-        share(lower_share * (1.0 - right_share)),
-        share(lower_share * right_share),
-    ];
-    for channel in (0..map.stride).step_by(S::LANES) {
-        // SAFETY: channel + LANES ≤ stride; `upper` and `lower` hold two strides, the panels a row of one and `values`
-        // one.
-        unsafe {
-            let upper = upper.as_ptr().add(channel);
-            let lower = lower.as_ptr().add(channel);
-            let mut sum = simd.mul(shares[0], simd.load(upper));
-            sum = simd.mul_add(shares[1], simd.load(upper.add(map.stride)), sum);
-            sum = simd.mul_add(shares[2], simd.load(lower), sum);
-            sum = simd.mul_add(shares[3], simd.load(lower.add(map.stride)), sum);
-            if S::INTEGERS {
-                simd.store(values.as_mut_ptr().add(channel), sum);
-            } else {
-                simd.store_factors(panels.as_mut_ptr().add(panel_place(row, channel) / S::FACTORS), sum);
+}
+
+/// Reads `map` at the places of each tap by bilinear interpolation, zero outside, into `row` of the panels of that tap,
+/// or into `values` [tap, channel] where factors are integers, whose scale is not known yet: returns in each lane the
+/// largest magnitude then.
+#[inline(always)]
+fn sample<S: Simd>(
+    simd: S,
+    map: &FeatureMap,
+    places: &Places,
+    row: usize,
+    taps: &mut [f32],
+    values: &mut [f32],
+) -> S::Vector {
+    let FeatureMap { stride, row_len, .. } = *map;
+    let Places { corners, shares } = places;
+    let (pixels, group_len) = (map.rows_from_above(0), taps.len() / TAPS);
+    assert!(group_len * S::FACTORS >= panels_len(stride) && row < ROWS && stride.is_multiple_of(S::LANES));
+    assert!(values.len() == TAPS * stride);
+    let mut magnitudes = simd.splat(0.0);
+    let both = taps.chunks_exact_mut(group_len).zip(values.chunks_exact_mut(stride));
+    for (k, (panels, values)) in both.enumerate() {
+        let upper = corners[0][k] as usize * row_len + corners[1][k] as usize * stride;
+        assert!(upper + row_len + 2 * stride <= pixels.len());
+        let shares = [shares[0][k], shares[1][k], shares[2][k], shares[3][k]];
+        for channel in (0..stride).step_by(S::LANES) {
+            // SAFETY: channel + LANES ≤ stride; two pixels of `stride` lie in `pixels` at `upper` and a row after it, as
+            // asserted above, the panels hold a row of so many and `values` one.
+            unsafe {
+                let upper = pixels.as_ptr().add(upper + channel);
+                let lower = upper.add(row_len);
+                let mut sum = simd.mul(simd.splat(shares[0]), simd.load(upper));
+                sum = simd.mul_add(simd.splat(shares[1]), simd.load(upper.add(stride)), sum);
+                sum = simd.mul_add(simd.splat(shares[2]), simd.load(lower), sum);
+                sum = simd.mul_add(simd.splat(shares[3]), simd.load(lower.add(stride)), sum);
+                if S::INTEGERS {
+                    magnitudes = simd.larger_magnitude(magnitudes, sum);
+                    simd.store(values.as_mut_ptr().add(channel), sum);
+                } else {
+                    simd.store_factors(panels.as_mut_ptr().add(panel_place(row, channel) / S::FACTORS), sum);
+                }
+            }
+        }
+    }
+    magnitudes
+}
+
+/// Writes a pixel's values [tap, channel], times `scale`, as integers to `row` of the panels of each tap.
+#[inline(always)]
+fn store_integers<S: Simd>(simd: S, scale: f32, values: &[f32], row: usize, taps: &mut [f32]) {
+    let (stride, group_len) = (values.len() / TAPS, taps.len() / TAPS);
+    assert!(stride.is_multiple_of(S::LANES) && group_len * S::FACTORS >= panels_len(stride) && row < ROWS);
+    let scale = simd.splat(scale);
+    for (values, panels) in values.chunks_exact(stride).zip(taps.chunks_exact_mut(group_len)) {
+        for (number, values) in values.chunks(PANEL).enumerate() {
+            let place = panel_place(row, number * PANEL) / S::FACTORS;
+            for (vector, values) in values.chunks_exact(S::LANES).enumerate() {
+                let value = simd.mul(simd.read(values), scale);
+                // SAFETY: each group of `taps` holds a row of `stride` channels, those of a panel beside one another.
+                unsafe { simd.store_factors(panels.as_mut_ptr().add(place + vector * S::LANES / S::FACTORS), value) };
             }
         }
     }
 }
 
-/// Writes a pixel's values [tap, channel] as integers to `row` of the panels of each tap, and returns what its sums are
-/// multiplied by.
-#[inline(always)]
-fn store_integers<S: Simd>(simd: S, shape: Shape, values: &[f32], row: usize, taps: &mut [f32]) -> f32 {
-    let (stride, group_len) = (values.len() / TAPS, taps.len() / TAPS);
-    assert!(stride.is_multiple_of(S::LANES) && group_len * S::FACTORS >= panels_len(stride) && row < ROWS);
-    let [scale, sums_scale] = integers_scale(simd, values, shape.largest_input());
-    let scale = simd.splat(scale);
-    for (values, panels) in values.chunks_exact(stride).zip(taps.chunks_exact_mut(group_len)) {
-        for (channel, vector) in (0..stride).step_by(S::LANES).zip(values.chunks_exact(S::LANES)) {
-            let value = simd.mul(simd.read(vector), scale);
-            // SAFETY: each group of `taps` holds a row of `stride` channels.
-            unsafe { simd.store_factors(panels.as_mut_ptr().add(panel_place(row, channel) / S::FACTORS), value) };
+#[cfg(test)]
+mod tests {
+    use rayon::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn taps_far_outside_and_those_that_are_no_number_read_zero() {
+        const CHANNELS: usize = 3;
+        const BIAS: f32 = 0.75;
+        for products in Products::available() {
+            // What every sample of a map is, and every offset.
+            let first_output = |sample: f32, offset: f32| {
+                let mut map = FeatureMap::new(6, 5, CHANNELS, products.set());
+                let (stride, width) = (map.stride, map.width);
+                map.rows_mut().for_each(|row| {
+                    row[stride..][..width * stride]
+                        .chunks_exact_mut(stride)
+                        .for_each(|pixel| pixel[..CHANNELS].fill(sample));
+                });
+                let mut output = FeatureMap::new(6, 5, 1, products.set());
+                let weight = |_, _, _| 1.0;
+                let mut conv = DeformableConv::new(CHANNELS, 6, &[BIAS], weight, Epilogue::None, 0.1, products);
+                conv.offset_conv.fill(&[0, 1, 2], [offset; OFFSET_CHANNELS].into_iter(), |_, _, _| 0.0);
+                conv.run(&map, &mut output);
+                (0..5).flat_map(|y| (0..6).map(move |x| (x, y))).map(|(x, y)| output.pixel(x, y)[0]).collect::<Vec<_>>()
+            };
+            for (sample, offset) in [(1.0, 7.0), (1.0, -7.5), (1.0, 1e30), (1.0, f32::NEG_INFINITY), (f32::NAN, 0.0)] {
+                let found = first_output(sample, offset);
+                assert_eq!(found, [BIAS; 6 * 5], "{} of {sample} at {offset}", products.name());
+            }
+            assert_ne!(first_output(1.0, 0.5)[0], BIAS, "the comparison is blind");
         }
     }
-    sums_scale
 }

@@ -75,7 +75,7 @@ impl View for DepthLayers {
     fn share_in_focus<S: Simd>(&self, simd: S, plane: usize, block: usize, y: usize) -> S::Vector {
         let mut share = simd.splat(0.0);
         for pixel in 0..PIXELS_PER_SAMPLE {
-            let layer = simd.read(self.layer_of.row_of_block(block, pixel, y));
+            let layer = simd.read(self.layer_of.rows_of_block(block, pixel, y));
             let part = simd.where_equal(layer, simd.splat(plane as f32), simd.splat(1.0 / PIXELS_PER_SAMPLE as f32));
             share = simd.add(share, part);
         }

@@ -1,5 +1,6 @@
 //! How a frame and fields become the map that both nets of a network read, and maps a field again.
 
+use std::array::from_fn;
 use std::ops::Range;
 
 use holod_calibration::{Colour, DisplayGeometry, Metres};
@@ -64,29 +65,40 @@ pub(super) fn write_inputs(
     stack: &ColumnBlocks,
     set: InstructionSet,
 ) {
-    let (told, blur_scale) = (conditions.told().map(|value| value as f32), conditions.blur_scale() as f32);
+    let told = conditions.told().map(|value| [value as f32; MOST_LANES]);
+    let blur_scale = conditions.blur_scale() as f32;
     map.write_channels(0..MAPS + stack.planes(), set, |block, y| Samples { frame, stack, told, blur_scale, block, y });
 }
 
-/// What is written to the channels of the pixels in one row of a block of columns.
+/// What is written to the channels of the pixels in rows of a block of columns.
 trait Channels {
-    /// One channel of each pixel.
-    fn channel<S: Simd>(&self, simd: S, channel: usize) -> S::Vector;
+    /// One channel of all of them.
+    fn source(&self, channel: usize) -> Source<'_>;
 }
 
-/// What nets are told of the samples of a block.
+/// Where the values of a channel lie, and what becomes of them: (value − less)·factor.
+struct Source<'a> {
+    /// From the first row on.
+    values: &'a [f32],
+    /// From one row to the next.
+    pitch: usize,
+    less: f32,
+    factor: f32,
+}
+
+/// What nets are told of the samples of a block from row `y` on.
 struct Samples<'a> {
     frame: &'a FrameBlocks,
     stack: &'a ColumnBlocks,
-    told: [f32; CONDITIONS],
+    /// A vector of each, whichever length vectors have.
+    told: [[f32; MOST_LANES]; CONDITIONS],
     blur_scale: f32,
     block: usize,
     y: usize,
 }
 
 impl Channels for Samples<'_> {
-    #[inline(always)]
-    fn channel<S: Simd>(&self, simd: S, channel: usize) -> S::Vector {
+    fn source(&self, channel: usize) -> Source<'_> {
         const AGAIN: usize = DEPTH + 1;
         let Self { frame, stack, told, blur_scale, block, y } = self;
         // The frame's planes, the depth once more, what is told, and the stack.
@@ -94,15 +106,17 @@ impl Channels for Samples<'_> {
             0..DEPTH => (&frame.planes, channel, 0.4, 1.0),
             DEPTH => (&frame.planes, channel, 0.5, 2.0),
             AGAIN => (&frame.planes, channel - PIXELS_PER_SAMPLE, 0.5, *blur_scale),
-            _ if channel < MAPS => return simd.splat(told[channel - 5 * PIXELS_PER_SAMPLE]),
+            _ if channel < MAPS => {
+                let values = &told[channel - 5 * PIXELS_PER_SAMPLE];
+                return Source { values, pitch: 0, less: 0.0, factor: 1.0 };
+            }
             _ => (*stack, channel - MAPS, 0.4, 1.0),
         };
-        let values = simd.read(planes.row_of_block(*block, plane, *y));
-        simd.mul(simd.sub(values, simd.splat(less)), simd.splat(factor))
+        Source { values: planes.rows_of_block(*block, plane, *y), pitch: planes.row_len(), less, factor }
     }
 }
 
-/// Planes beside one another, of complex ones first all real parts.
+/// Planes beside one another, of complex ones first all real parts, in a block from row `y` on.
 struct Planes<'a> {
     blocks: &'a [&'a ColumnBlocks],
     block: usize,
@@ -110,14 +124,15 @@ struct Planes<'a> {
 }
 
 impl Channels for Planes<'_> {
-    #[inline(always)]
-    fn channel<S: Simd>(&self, simd: S, channel: usize) -> S::Vector {
+    fn source(&self, channel: usize) -> Source<'_> {
         let mut plane = channel;
         for blocks in self.blocks {
             let count = blocks.planes() * blocks.parts();
             if plane < count {
                 let (part, plane) = (plane / blocks.planes(), plane % blocks.planes());
-                return simd.read(&blocks.row_of_block(self.block, plane, self.y)[part * S::LANES..]);
+                let pitch = blocks.row_len();
+                let values = &blocks.rows_of_block(self.block, plane, self.y)[part * pitch / blocks.parts()..];
+                return Source { values, pitch, less: 0.0, factor: 1.0 };
             }
             plane -= count;
         }
@@ -125,12 +140,16 @@ impl Channels for Planes<'_> {
     }
 }
 
-/// Writes channels to pixels.
+/// Writes channels to the pixels in rows of a block of columns. As many channels as a vector has lanes go through all
+/// rows before the next ones do: what lies beside one another in memory is read together.
 struct WriteChannels<'a, C> {
     count: usize,
     channels: C,
-    /// From the first channel that is written on.
-    to: &'a mut [f32],
+    rows: &'a mut [f32],
+    row_len: usize,
+    /// Where in a row the first channel of the first pixel lies.
+    first: usize,
+    pixels: usize,
     /// From one pixel to the next.
     stride: usize,
 }
@@ -139,25 +158,29 @@ impl<C: Channels> Task for WriteChannels<'_, C> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         const { assert!(S::LANES <= MOST_LANES) };
-        let (mut rows, mut columns) = ([[0.0; MOST_LANES]; MOST_LANES], [[0.0; MOST_LANES]; MOST_LANES]);
-        let count = S::LANES.min(self.count);
-        for first in (0..self.count).step_by(S::LANES) {
+        let Self { count: all, channels, rows, row_len, first: place, pixels, stride } = self;
+        let (mut by_channel, mut by_pixel) = ([[0.0; MOST_LANES]; MOST_LANES], [[0.0; MOST_LANES]; MOST_LANES]);
+        let count = S::LANES.min(all);
+        for first in (0..all).step_by(S::LANES) {
             // The last ones begin early enough to be whole vectors, too.
-            let first = first.min(self.count - count);
-            for (channel, row) in rows.iter_mut().enumerate().take(count) {
-                simd.write(row, self.channels.channel(simd, first + channel));
-            }
-            // SAFETY: both have MOST_LANES rows of so many values, of which LANES, no more, are read and written.
-            unsafe {
-                let (rows, columns) = (rows.as_flattened().as_ptr(), columns.as_flattened_mut().as_mut_ptr());
-                simd.transpose(rows, columns, [MOST_LANES; 2]);
-            }
-            for (pixel, channels) in self.to.chunks_mut(self.stride).zip(&columns) {
-                let pixel = &mut pixel[first..][..count];
-                if count == S::LANES {
-                    simd.write(pixel, simd.read(channels));
-                } else {
-                    pixel.iter_mut().zip(channels).for_each(|(to, from)| *to = *from);
+            let first = first.min(all - count);
+            let sources: [_; MOST_LANES] = from_fn(|channel| channels.source(first + channel.min(count - 1)));
+            for (y, row) in rows.chunks_exact_mut(row_len).enumerate() {
+                for (source, values) in sources.iter().zip(&mut by_channel).take(count) {
+                    let less = simd.sub(simd.read(&source.values[y * source.pitch..]), simd.splat(source.less));
+                    simd.write(values, simd.mul(less, simd.splat(source.factor)));
+                }
+                // SAFETY: both have MOST_LANES rows of so many values, of which LANES, no more, are read and written.
+                unsafe {
+                    let (from, to) = (by_channel.as_flattened().as_ptr(), by_pixel.as_flattened_mut().as_mut_ptr());
+                    simd.transpose(from, to, [MOST_LANES; 2]);
+                }
+                for (pixel, values) in row[place + first..].chunks_mut(stride).zip(&by_pixel).take(pixels) {
+                    if count == S::LANES {
+                        simd.write(pixel, simd.read(values));
+                    } else {
+                        pixel.iter_mut().zip(&values[..count]).for_each(|(to, from)| *to = *from);
+                    }
                 }
             }
         }
@@ -172,7 +195,7 @@ impl FeatureMap {
         self.write_channels(first..first + count, set, |block, y| Planes { blocks, block, y });
     }
 
-    /// Writes what `channels(block, y)` has to the channels in `range`.
+    /// Writes what `channels(block, y)` has from row y on to the channels in `range`.
     fn write_channels<C: Channels>(
         &mut self,
         range: Range<usize>,
@@ -180,14 +203,12 @@ impl FeatureMap {
         channels: impl Fn(usize, usize) -> C + Sync,
     ) {
         let (width, stride, row_len, lanes) = (self.width, self.stride, self.row_len, set.lanes());
-        let Range { start: first, end } = range;
+        let count = range.len();
         self.bands_mut().enumerate().for_each(|(band, rows)| {
             for (block, x) in (0..width).step_by(lanes).enumerate() {
-                let pixels = lanes.min(width - x);
-                for (y, row) in (band * BAND..).zip(rows.chunks_exact_mut(row_len)) {
-                    let to = &mut row[(x + 1) * stride + first..][..pixels * stride - first];
-                    set.run(WriteChannels { count: end - first, channels: channels(block, y), to, stride });
-                }
+                let (first, pixels) = ((x + 1) * stride + range.start, lanes.min(width - x));
+                let channels = channels(block, band * BAND);
+                set.run(WriteChannels { count, channels, rows, row_len, first, pixels, stride });
             }
         });
     }

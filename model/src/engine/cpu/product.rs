@@ -6,7 +6,7 @@ use crate::simd::{MOST_LANES, Products, Simd};
 pub(super) const ROWS: usize = 24;
 /// Channels are kept in panels [panel, row, channel of the panel] of this many: the distance between rows is then a
 /// constant of the kernel. Inputs lie there as words of factors ([`Simd::FACTORS`]).
-const PANEL: usize = 32;
+pub(super) const PANEL: usize = 32;
 /// Words of inputs that are taken together.
 const PAIR: usize = 2;
 /// Integers, where factors are some, are no larger than 16 bits hold, and neither are their products' sums than 32 do.
@@ -105,14 +105,10 @@ impl Shape {
     }
 }
 
-/// What values are multiplied by to become integers up to `largest`, by the largest magnitude of `values`, in whole
-/// vectors, and its reciprocal. One of the two is no finite number where one of the values is none.
+/// What values are multiplied by to become integers up to `largest`, by the largest magnitude that a lane of
+/// `magnitudes` has, and its reciprocal. One of the two is no finite number where one of the lanes is none.
 #[inline(always)]
-pub(super) fn integers_scale<S: Simd>(simd: S, values: &[f32], largest: f32) -> [f32; 2] {
-    let mut magnitudes = simd.splat(0.0);
-    for vector in values.chunks_exact(S::LANES) {
-        magnitudes = simd.larger_magnitude(magnitudes, simd.read(vector));
-    }
+pub(super) fn integers_scale<S: Simd>(simd: S, magnitudes: S::Vector, largest: f32) -> [f32; 2] {
     let mut lanes = [0.0; MOST_LANES];
     simd.write(&mut lanes, magnitudes);
     let mut found = SMALLEST.to_bits();
