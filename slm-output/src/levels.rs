@@ -124,8 +124,10 @@ pub struct PanelEncoder {
 
 #[derive(Clone, Debug)]
 struct ColourEncoder {
-    /// The level of each phase bin, with [`UNREACHABLE`] set where it is not near.
-    table: Vec<u32>,
+    /// The level of each phase bin.
+    table: Vec<u16>,
+    /// 1 for each phase bin whose level is not near; none where there is no such bin.
+    unreachable: Option<Vec<u8>>,
     /// Phase that each level shows on a flat panel, with its whole turns; not a number where the panel's table leaves
     /// it out.
     phase_of_level_rad: Vec<f32>,
@@ -195,7 +197,7 @@ impl PanelEncoder {
             mirrors: self.mirrors,
             interleaved: self.layout.mode == PanelMode::ChannelPacked,
             field_order: self.layout.field_order,
-            levels: PerColour(Colour::ALL.map(|colour| of(colour).table.clone())),
+            levels: PerColour(Colour::ALL.map(|colour| of(colour).levels_and_marks())),
             flatness: PerColour(Colour::ALL.map(|colour| of(colour).flatness_entries.clone())),
         }
     }
@@ -352,7 +354,19 @@ impl ColourEncoder {
         for LevelPhase { level, phase_rad } in signed {
             phase_of_level_rad[usize::from(level)] = phase_rad as f32;
         }
-        Ok(Self { table, phase_of_level_rad, flatness_entries })
+        let unreachable: Vec<_> = table.iter().map(|entry| (entry / UNREACHABLE) as u8).collect();
+        Ok(Self {
+            table: table.into_iter().map(|entry| entry as u16).collect(),
+            unreachable: unreachable.contains(&1).then_some(unreachable),
+            phase_of_level_rad,
+            flatness_entries,
+        })
+    }
+
+    /// The level of each phase bin, with [`UNREACHABLE`] set where it is not near.
+    fn levels_and_marks(&self) -> Vec<u32> {
+        let mark = |bin: usize| self.unreachable.as_ref().map_or(0, |all| u32::from(all[bin]) * UNREACHABLE);
+        self.table.iter().enumerate().map(|(bin, &level)| u32::from(level) | mark(bin)).collect()
     }
 
     /// Encodes `phases_rad` into the panel pixels from `first` on, of which `samples` are; returns how many are out of
@@ -427,11 +441,13 @@ impl ColourEncoder {
                     }
                 }
             }
+            let indices = &indices[..phases_rad.len()];
             let samples = samples[start * STRIDE..].iter_mut().step_by(STRIDE);
-            for (sample, &index) in samples.zip(&indices[..phases_rad.len()]) {
-                let entry = self.table[usize::from(index)];
-                unreachable += (entry / UNREACHABLE) as usize;
-                *sample = entry as u16;
+            for (sample, &index) in samples.zip(indices) {
+                *sample = self.table[usize::from(index)];
+            }
+            if let Some(marks) = &self.unreachable {
+                unreachable += indices.iter().map(|&index| usize::from(marks[usize::from(index)])).sum::<usize>();
             }
         }
         unreachable

@@ -170,17 +170,17 @@ impl<C: Channels> Task for WriteChannels<'_, C> {
                     let less = simd.sub(simd.read(&source.values[y * source.pitch..]), simd.splat(source.less));
                     simd.write(values, simd.mul(less, simd.splat(source.factor)));
                 }
-                // SAFETY: both have MOST_LANES rows of so many values, of which LANES, no more, are read and written.
-                unsafe {
-                    let (from, to) = (by_channel.as_flattened().as_ptr(), by_pixel.as_flattened_mut().as_mut_ptr());
-                    simd.transpose(from, to, [MOST_LANES; 2]);
+                let (from, to) = (by_channel.as_flattened().as_ptr(), &mut row[place + first..]);
+                if [pixels, count] == [S::LANES; 2] {
+                    assert!(to.len() >= (S::LANES - 1) * stride + S::LANES);
+                    // SAFETY: LANES rows of so many values lie in `by_channel`, and in `to` as asserted.
+                    unsafe { simd.transpose(from, to.as_mut_ptr(), [MOST_LANES, stride]) };
+                    continue;
                 }
-                for (pixel, values) in row[place + first..].chunks_mut(stride).zip(&by_pixel).take(pixels) {
-                    if count == S::LANES {
-                        simd.write(pixel, simd.read(values));
-                    } else {
-                        pixel.iter_mut().zip(&values[..count]).for_each(|(to, from)| *to = *from);
-                    }
+                // SAFETY: both have MOST_LANES rows of so many values, of which LANES, no more, are read and written.
+                unsafe { simd.transpose(from, by_pixel.as_flattened_mut().as_mut_ptr(), [MOST_LANES; 2]) };
+                for (pixel, values) in to.chunks_mut(stride).zip(&by_pixel).take(pixels) {
+                    pixel.iter_mut().zip(&values[..count]).for_each(|(to, from)| *to = *from);
                 }
             }
         }

@@ -22,6 +22,23 @@ pub(super) enum Direction {
     Inverse,
 }
 
+/// Cells that lie beside one another in squares, of as many cells as a vector has lanes each.
+#[derive(Clone, Copy)]
+pub(super) struct Squares<'a> {
+    /// From the first one on.
+    pub(super) values: &'a [f32],
+    /// From one to the next.
+    pub(super) pitch: usize,
+}
+
+impl Squares<'_> {
+    /// Where cell number `cell` begins.
+    #[inline(always)]
+    fn place<S: Simd>(self, cell: usize) -> usize {
+        cell / S::LANES * self.pitch + cell % S::LANES * 2 * S::LANES
+    }
+}
+
 /// A complex number in each lane.
 type Cell<S> = [<S as Simd>::Vector; 2];
 /// [cos, sin] of minus so many parts of a turn.
@@ -99,7 +116,26 @@ impl LineFft {
         to: &mut [f32],
         scratch: &mut FftScratch,
     ) {
-        assert!(from.len() == self.length * 2 * S::LANES && to.len() == from.len());
+        assert!(from.len() == self.length * 2 * S::LANES);
+        self.transform_squares(simd, direction, Squares { values: from, pitch: 2 * S::LANES * S::LANES }, to, scratch);
+    }
+
+    /// Whether it is passes that transform lines of this length.
+    pub(super) fn has_passes(&self) -> bool {
+        !self.passes.is_empty()
+    }
+
+    /// The same of cells in squares, which lie apart from one another only where it [has passes](Self::has_passes).
+    #[inline(always)]
+    pub(super) fn transform_squares<S: Simd>(
+        &self,
+        simd: S,
+        direction: Direction,
+        from: Squares<'_>,
+        to: &mut [f32],
+        scratch: &mut FftScratch,
+    ) {
+        assert!(to.len() == self.length * 2 * S::LANES && from.values.len() > from.place::<S>(self.length - 1));
         // Every caller with a copy of its own would take minutes to compile.
         simd.vectorise(Transform { fft: self, direction, from, to, scratch });
     }
@@ -108,7 +144,7 @@ impl LineFft {
 struct Transform<'a> {
     fft: &'a LineFft,
     direction: Direction,
-    from: &'a [f32],
+    from: Squares<'a>,
     to: &'a mut [f32],
     scratch: &'a mut FftScratch,
 }
@@ -117,18 +153,20 @@ impl Task for Transform<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { fft, direction, from, to, scratch } = self;
+        let beside = 2 * S::LANES * S::LANES;
         if let Some(single) = &fft.single {
-            return transform_each::<S>(&**single, direction, from, to, scratch);
+            assert!(from.pitch == beside, "only passes take squares apart");
+            return transform_each::<S>(&**single, direction, &from.values[..to.len()], to, scratch);
         }
         let [even, odd] = &mut scratch.cells;
         for (number, pass) in fft.passes.iter().enumerate() {
             let (before, after) = if number.is_multiple_of(2) { (&*odd, &mut *even) } else { (&*even, &mut *odd) };
-            let source = if number == 0 { from } else { before };
+            let source = if number == 0 { from } else { Squares { values: before, pitch: beside } };
             let target = if number + 1 == fft.passes.len() { &mut *to } else { after };
             pass.run(simd, direction, source, target);
         }
         if fft.passes.is_empty() {
-            to.copy_from_slice(from);
+            to.copy_from_slice(&from.values[..to.len()]);
         }
     }
 }
@@ -186,7 +224,7 @@ const fn parts<S: Simd>(direction: Direction) -> [usize; 2] {
 
 impl Pass {
     #[inline(always)]
-    fn run<S: Simd>(&self, simd: S, direction: Direction, from: &[f32], to: &mut [f32]) {
+    fn run<S: Simd>(&self, simd: S, direction: Direction, from: Squares<'_>, to: &mut [f32]) {
         match self.radix {
             2 => self.butterflies::<S, 2>(simd, direction, from, to),
             3 => self.butterflies::<S, 3>(simd, direction, from, to),
@@ -202,21 +240,28 @@ impl Pass {
     }
 
     #[inline(always)]
-    fn butterflies<S: Simd, const R: usize>(&self, simd: S, direction: Direction, from: &[f32], to: &mut [f32]) {
+    fn butterflies<S: Simd, const R: usize>(&self, simd: S, direction: Direction, from: Squares<'_>, to: &mut [f32]) {
         let Self { groups, stride, turns, circle, .. } = self;
         let (groups, stride, cell) = (*groups, *stride, 2 * S::LANES);
         let [re, im] = parts::<S>(direction);
-        assert!(from.len() == R * groups * stride * cell && to.len() == from.len() && turns.len() == groups * (R - 1));
+        assert!(stride == 1 || from.pitch == S::LANES * cell, "only the first pass takes squares apart");
+        assert!(from.values.len() >= from.place::<S>(R * groups * stride - 1) + cell);
+        assert!(to.len() == R * groups * stride * cell);
+        assert!(turns.len() == groups * (R - 1));
         for group in 0..groups {
             let turns = &turns[group * (R - 1)..][..R - 1];
+            let mut places = [0; R];
+            for (index, place) in places.iter_mut().enumerate() {
+                *place = from.place::<S>((index * groups + group) * stride);
+            }
             for sample in 0..stride {
-                // SAFETY: of `from`, the cells below R·groups·stride are read, and the same of `to` are written; both
-                // have so many, as asserted above.
+                // SAFETY: `from` has the cells below R·groups·stride, which are read, and `to` the same, which are
+                // written: both as asserted above. Those of one index lie beside one another.
                 unsafe {
-                    let from = from.as_ptr().add((group * stride + sample) * cell);
+                    let from = from.values.as_ptr().add(sample * cell);
                     let mut values = [[simd.splat(0.0); 2]; R];
-                    for (index, value) in values.iter_mut().enumerate() {
-                        let from = from.add(index * groups * stride * cell);
+                    for (value, place) in values.iter_mut().zip(places) {
+                        let from = from.add(place);
                         *value = [simd.load(from.add(re)), simd.load(from.add(im))];
                     }
                     let values = dft::<S, R>(simd, values, circle, 1);
@@ -366,6 +411,7 @@ mod tests {
                 }
                 let mut transformed = |direction, from: &[f32]| {
                     let mut to = vec![f32::NAN; from.len()];
+                    let from = Squares { values: from, pitch: 2 * lanes * lanes };
                     set.run(Transform { fft: &fft, direction, from, to: &mut to, scratch: &mut scratch });
                     to
                 };

@@ -173,23 +173,28 @@ impl Task for TakeOutputs<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { map, first, outputs, planes } = self;
+        // So many rows of a pixel's channels stay in the cache while these are taken, as many as a vector has lanes at a
+        // time: what is written then lies beside one another.
+        const ROWS: usize = 8;
         let plane_len = map.height * S::LANES;
-        for y in 0..map.height {
-            let pixels = map.pixels_from(first, y);
+        for first_row in (0..map.height).step_by(ROWS) {
             for channel in (0..map.stride).step_by(S::LANES) {
-                let to = &mut outputs[channel * plane_len + y * S::LANES..];
-                if pixels.len() >= S::LANES * map.stride {
-                    assert!(to.len() >= (S::LANES - 1) * plane_len + S::LANES);
-                    // SAFETY: a square of channels and pixels lies in both slices: in `pixels` with its last pixel, in
-                    // `to` as asserted.
-                    unsafe {
-                        simd.transpose(pixels.as_ptr().add(channel), to.as_mut_ptr(), [map.stride, plane_len]);
+                for y in first_row..(first_row + ROWS).min(map.height) {
+                    let pixels = map.pixels_from(first, y);
+                    let to = &mut outputs[channel * plane_len + y * S::LANES..];
+                    if pixels.len() >= S::LANES * map.stride {
+                        assert!(to.len() >= (S::LANES - 1) * plane_len + S::LANES);
+                        // SAFETY: a square of channels and pixels lies in both slices: in `pixels` with its last pixel,
+                        // in `to` as asserted.
+                        unsafe {
+                            simd.transpose(pixels.as_ptr().add(channel), to.as_mut_ptr(), [map.stride, plane_len]);
+                        }
+                        continue;
                     }
-                    continue;
-                }
-                for (column, pixel) in pixels.chunks_exact(map.stride).enumerate() {
-                    for (lane, value) in pixel[channel..][..S::LANES].iter().enumerate() {
-                        to[lane * plane_len + column] = *value;
+                    for (column, pixel) in pixels.chunks_exact(map.stride).enumerate() {
+                        for (lane, value) in pixel[channel..][..S::LANES].iter().enumerate() {
+                            to[lane * plane_len + column] = *value;
+                        }
                     }
                 }
             }
