@@ -1,5 +1,7 @@
 //! The levels of a colour frame as the panel is sent them, and back again.
 
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use holod_calibration::rig::{Packing, Panel, PanelMode, VideoMargins};
 use holod_calibration::{Colour, Resolution};
 use rayon::prelude::*;
@@ -111,11 +113,35 @@ impl FrameLayout {
 ///   whatever their colours are; the video's channels carry them as [`FrameLayout::channel_order`] says.
 /// - Field-sequential and monochrome: three gray video frames `[3 (shown order), height, width]`; whoever sends one to
 ///   a colour video link repeats each level in R, G and B. In monochrome mode the panel shows one of them only.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub struct LevelsFrame {
     pub(crate) tag: FrameTag,
     layout: FrameLayout,
     samples: Vec<u16>,
+    /// Which encoder's surround lies around its pattern; none since anything else wrote here.
+    pub(crate) surround: Option<SurroundId>,
+}
+
+/// Numbers what an encoder writes around its patterns.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct SurroundId(u64);
+
+impl SurroundId {
+    /// One that there has not been.
+    pub(crate) fn new() -> Self {
+        static NEXT: AtomicU64 = AtomicU64::new(0);
+        Self(NEXT.fetch_add(1, Ordering::Relaxed))
+    }
+}
+
+impl Eq for LevelsFrame {}
+
+impl PartialEq for LevelsFrame {
+    /// Who wrote the samples makes no difference.
+    fn eq(&self, other: &Self) -> bool {
+        let Self { tag, layout, samples, surround: _ } = self;
+        (tag, layout, samples) == (&other.tag, &other.layout, &other.samples)
+    }
 }
 
 /// What travels with a frame's levels.
@@ -134,7 +160,7 @@ pub struct FrameTag {
 impl LevelsFrame {
     /// A frame whose every sample is level 0.
     pub fn new(layout: FrameLayout) -> Self {
-        Self { tag: FrameTag::default(), layout, samples: vec![0; FIELDS * layout.resolution.pixels()] }
+        Self { tag: FrameTag::default(), layout, samples: vec![0; FIELDS * layout.resolution.pixels()], surround: None }
     }
 
     /// The frame's number and times.
@@ -154,6 +180,7 @@ impl LevelsFrame {
 
     /// All samples, to be written as a whole by whoever has made them as the panel takes them.
     pub fn samples_mut(&mut self) -> &mut [u16] {
+        self.surround = None;
         &mut self.samples
     }
 
@@ -185,12 +212,14 @@ impl LevelsFrame {
     /// The levels of `colour`, to be written.
     pub fn field_mut(&mut self, colour: Colour) -> FieldMut<'_> {
         let (stride, offset) = (self.layout.stride(), self.layout.offset(self.layout.position_of(colour)));
+        self.surround = None;
         FieldMut { samples: &mut self.samples[offset..], stride, resolution: self.layout.resolution }
     }
 
     /// All rows of samples, to be written by the threads of the pool that this is called in.
     pub(crate) fn par_rows_mut(&mut self) -> impl IndexedParallelIterator<Item = RowMut<'_>> {
-        let Self { layout, samples, .. } = self;
+        let Self { layout, samples, surround, .. } = self;
+        *surround = None;
         let FrameLayout { resolution: Resolution { width, height }, field_order, .. } = *layout;
         let stride = layout.stride();
         samples.par_chunks_exact_mut((width * stride).max(1)).enumerate().map(move |(index, samples)| {
@@ -200,6 +229,12 @@ impl LevelsFrame {
             }
             RowMut { row: index % height, colours, count, samples }
         })
+    }
+
+    /// Writes one sample without a trace of it.
+    #[cfg(test)]
+    pub(crate) fn write_unseen(&mut self, index: usize, sample: u16) {
+        self.samples[index] = sample;
     }
 
     /// Takes the levels of `colour` out of the frame.
@@ -221,6 +256,7 @@ impl LevelsFrame {
         assert_eq!(self.layout, other.layout, "frames of one output have one layout");
         self.tag = other.tag;
         self.samples.copy_from_slice(&other.samples);
+        self.surround = other.surround;
     }
 }
 

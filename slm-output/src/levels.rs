@@ -27,7 +27,7 @@ use holod_calibration::rig::{LevelPhase, OutOfStroke, Panel, PanelMode, PhaseSig
 use holod_calibration::{Colour, LevelTables, PerColour, Resolution};
 use rayon::prelude::*;
 
-use crate::fields::{FrameLayout, LevelsFrame, Strided};
+use crate::fields::{FrameLayout, LevelsFrame, Strided, SurroundId};
 
 /// Table entries for each level, as far as [`ENTRIES_MAX`] allows.
 const ENTRIES_PER_LEVEL: usize = 16;
@@ -120,6 +120,7 @@ pub struct PanelEncoder {
     /// Whether a pattern's columns run the other way on the panel, and whether its rows do.
     mirrors: [bool; 2],
     colours: [ColourEncoder; 3],
+    surround: SurroundId,
 }
 
 #[derive(Clone, Debug)]
@@ -168,6 +169,7 @@ impl PanelEncoder {
             pattern: pattern_resolution,
             mirrors: panel.orientation.mirrors(),
             colours,
+            surround: SurroundId::new(),
         })
     }
 
@@ -203,7 +205,8 @@ impl PanelEncoder {
     }
 
     /// Encodes three patterns into `frame`: each phase in radians `[height, width]`, row-major, nominally in [0, 2π);
-    /// phases within ±50 turns are wrapped. The threads of the rayon pool that this is called in share the rows; called
+    /// phases within ±50 turns are wrapped. What is around them is written where the frame does not have it yet from an
+    /// earlier pattern. The threads of the rayon pool that this is called in share the rows; called
     /// from one of them it does not allocate.
     ///
     /// # Panics
@@ -213,21 +216,26 @@ impl PanelEncoder {
         for (_, phase_rad) in phase_rad.iter() {
             assert_eq!(phase_rad.len(), self.pattern.pixels(), "a pattern has one phase for each pixel");
         }
+        let has_surround = frame.surround == Some(self.surround);
         let rows = frame.par_rows_mut().map(|mut row| {
             let mut unreachable = [0; 3];
             let y = row.row;
-            row.for_each(|colour, samples| {
-                unreachable[colour.index()] = self.encode_row(colour, y, phase_rad[colour], samples);
+            row.for_each(|colour, mut samples| {
+                if !has_surround {
+                    self.encode_surround(colour, y, &mut samples);
+                }
+                unreachable[colour.index()] = self.encode_row(colour, y, phase_rad[colour], &mut samples);
             });
             unreachable
         });
         let unreachable = rows.reduce(|| [0; 3], |one, other| [0, 1, 2].map(|colour| one[colour] + other[colour]));
+        frame.surround = Some(self.surround);
         let share = |count| count as f32 / self.pattern.pixels().max(1) as f32;
         EncodeReport { unreachable_share: PerColour(unreachable.map(share)) }
     }
 
-    /// Encodes what `colour` shows in row `y` of the panel; returns how many of its pixels are out of reach.
-    fn encode_row(&self, colour: Colour, y: usize, phase_rad: &[f32], mut samples: Strided<'_>) -> usize {
+    /// Encodes what `colour` shows around its pattern in row `y` of the panel.
+    fn encode_surround(&self, colour: Colour, y: usize, samples: &mut Strided<'_>) {
         let encoder = &self.colours[colour.index()];
         let (left, top) = self.pattern_origin();
         let width = self.layout.resolution.width;
@@ -237,20 +245,31 @@ impl PanelEncoder {
         // Of the pattern's own column and row, gone on with beyond its edges.
         let turned = usize::from(mirrors_x) * (pattern_width + 1) + usize::from(mirrors_y) * (pattern_height + 1);
         let is_odd = |x: usize| (x + left + y + top + turned) % 2 == 1;
-        if y < top || y >= top + self.pattern.height {
-            encoder.encode_dark(first, width, is_odd(0), &mut samples);
+        if y < top || y >= top + pattern_height {
+            encoder.encode_dark(first, width, is_odd(0), samples);
+            return;
+        }
+        let right = left + pattern_width;
+        encoder.encode_dark(first, left, is_odd(0), samples);
+        encoder.encode_dark(first + right, width - right, is_odd(right), &mut samples.from(right));
+    }
+
+    /// Encodes what `colour` shows of its pattern in row `y` of the panel; returns how many of its pixels are out of
+    /// reach.
+    fn encode_row(&self, colour: Colour, y: usize, phase_rad: &[f32], samples: &mut Strided<'_>) -> usize {
+        let encoder = &self.colours[colour.index()];
+        let (left, top) = self.pattern_origin();
+        let Resolution { width, height } = self.pattern;
+        if y < top || y >= top + height {
             return 0;
         }
-        let row = if mirrors_y { pattern_height - 1 - (y - top) } else { y - top };
-        let phases_rad = &phase_rad[row * pattern_width..][..pattern_width];
-        let right = left + pattern_width;
-        encoder.encode_dark(first, left, is_odd(0), &mut samples);
-        let unreachable = match mirrors_x {
-            false => encoder.encode_run(first + left, phases_rad, &mut samples.from(left)),
-            true => encoder.encode_mirrored(first + left, phases_rad, &mut samples.from(left)),
-        };
-        encoder.encode_dark(first + right, width - right, is_odd(right), &mut samples.from(right));
-        unreachable
+        let [mirrors_x, mirrors_y] = self.mirrors;
+        let row = if mirrors_y { height - 1 - (y - top) } else { y - top };
+        let (phases_rad, first) = (&phase_rad[row * width..][..width], y * self.layout.resolution.width + left);
+        match mirrors_x {
+            false => encoder.encode_run(first, phases_rad, &mut samples.from(left)),
+            true => encoder.encode_mirrored(first, phases_rad, &mut samples.from(left)),
+        }
     }
 
     /// Encodes the flat pattern, phase 0 everywhere, in every colour.
@@ -876,6 +895,48 @@ mod tests {
         assert_eq!(first_wrong(&half_turn, &encoder.decode_pattern(Colour::Red, &levels), 1e-6), None);
         encoder.encode_flat(&mut frame);
         assert_eq!(frame.samples(), [0; 90]);
+    }
+
+    #[test]
+    fn a_surround_is_written_once_and_again_after_anything_else_was() {
+        let (big, small, row) = (
+            Resolution { width: 6, height: 5 },
+            Resolution { width: 3, height: 2 },
+            Resolution { width: 5, height: 1 },
+        );
+        let of = |pattern| PanelEncoder::new(&panel(), big, pattern).unwrap();
+        let (encoder, other) = (of(small), of(row));
+        let encode = |encoder: &PanelEncoder, frame: &mut LevelsFrame, phase_rad: f32| {
+            let pattern = vec![phase_rad; encoder.pattern_resolution().pixels()];
+            encoder.encode(PerColour([&pattern; 3]), frame);
+        };
+        let fresh = |encoder, phase_rad| {
+            let mut frame = LevelsFrame::new(FrameLayout::new(&panel(), big));
+            encode(encoder, &mut frame, phase_rad);
+            frame
+        };
+        let mut frame = fresh(&encoder, 1.0);
+        // The frame cannot see this change, and so its surround shows that it was not written again.
+        let first = frame.samples()[0];
+        frame.write_unseen(0, 77);
+        encode(&encoder, &mut frame, 2.0);
+        assert_eq!(frame.samples()[0], 77);
+        frame.write_unseen(0, first);
+        assert_eq!(frame, fresh(&encoder, 2.0));
+
+        let overwrites: [&dyn Fn(&mut LevelsFrame); 5] = [
+            &|frame| encode(&other, frame, 3.0),
+            &|frame| encoder.encode_flat(frame),
+            &|frame| frame.samples_mut().fill(77),
+            &|frame| frame.field_mut(Colour::Blue).write(&[77; 30]),
+            &|frame| frame.copy_from(&LevelsFrame::new(FrameLayout::new(&panel(), big))),
+        ];
+        for (number, overwrite) in overwrites.into_iter().enumerate() {
+            let mut frame = fresh(&encoder, 1.0);
+            overwrite(&mut frame);
+            encode(&encoder, &mut frame, 2.0);
+            assert_eq!(frame, fresh(&encoder, 2.0), "after overwrite {number}");
+        }
     }
 
     fn on_panel(orientation: Orientation, size: Resolution, pattern: Resolution, phase_rad: &[f32]) -> Vec<u16> {
