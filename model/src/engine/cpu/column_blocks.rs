@@ -6,7 +6,6 @@
 use std::ops::DerefMut;
 
 use holod_calibration::Resolution;
-use num_complex::Complex32;
 use rayon::prelude::*;
 
 use crate::simd::{InstructionSet, Simd};
@@ -102,21 +101,20 @@ impl<V: DerefMut<Target = [f32]>> ColumnBlocks<V> {
         &self.values[block * self.block_len() + plane * plane_len..][..plane_len][first..]
     }
 
-    /// Row `y` of one complex plane.
-    pub(super) fn row_of_cells(&self, plane: usize, y: usize) -> impl Iterator<Item = Complex32> {
-        assert_eq!(self.parts, 2);
-        let cells = (0..self.size.width.div_ceil(self.lanes)).flat_map(move |block| {
-            let (re, im) = self.rows_of_block(block, plane, y)[..self.row_len()].split_at(self.lanes);
-            re.iter().zip(im).map(|(re, im)| Complex32::new(*re, *im))
-        });
-        cells.take(self.size.width)
-    }
-
     /// All complex planes, [plane, height, width].
     #[cfg(test)]
-    pub(super) fn to_fields(&self) -> Vec<Complex32> {
-        let rows = (0..self.planes).flat_map(|plane| (0..self.size.height).map(move |y| (plane, y)));
-        rows.flat_map(|(plane, y)| self.row_of_cells(plane, y)).collect()
+    pub(super) fn to_fields(&self) -> Vec<num_complex::Complex32> {
+        assert_eq!(self.parts, 2);
+        let Resolution { width, height } = self.size;
+        let rows = (0..self.planes).flat_map(|plane| (0..height).map(move |y| (plane, y)));
+        rows.flat_map(|(plane, y)| {
+            let cells = (0..width.div_ceil(self.lanes)).flat_map(move |block| {
+                let (re, im) = self.rows_of_block(block, plane, y)[..self.row_len()].split_at(self.lanes);
+                re.iter().zip(im).map(|(re, im)| num_complex::Complex32::new(*re, *im))
+            });
+            cells.take(width)
+        })
+        .collect()
     }
 
     /// Writes `value(plane, x, y)` to real planes.

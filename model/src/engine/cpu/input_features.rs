@@ -216,11 +216,19 @@ impl FeatureMap {
     /// Writes `base` and a share of this correction of one colour to `field` [height, width]; the map's channels are
     /// three real parts and three imaginary ones.
     pub(super) fn correct(&self, base: &ColumnBlocks, colour: Colour, field: &mut [Complex32]) {
-        field.par_chunks_exact_mut(self.width).enumerate().for_each(|(y, row)| {
-            for (x, (value, base)) in row.iter_mut().zip(base.row_of_cells(colour.index(), y)).enumerate() {
-                let residual = self.pixel(x, y);
-                let residual = Complex32::new(residual[colour.index()], residual[3 + colour.index()]);
-                *value = base + residual * CORRECTION_SHARE;
+        let (width, lanes) = (self.width, base.row_len() / base.parts());
+        // As in `write_channels`, a block of columns after another.
+        field.par_chunks_mut(BAND * width).enumerate().for_each(|(band, rows)| {
+            for (block, x) in (0..width).step_by(lanes).enumerate() {
+                let cells = base.rows_of_block(block, colour.index(), band * BAND).chunks_exact(base.row_len());
+                for (y, (row, cell)) in (band * BAND..).zip(rows.chunks_exact_mut(width).zip(cells)) {
+                    let (re, im) = cell.split_at(lanes);
+                    for ((x, value), (re, im)) in (x..).zip(&mut row[x..]).zip(re.iter().zip(im)) {
+                        let residual = self.pixel(x, y);
+                        let residual = Complex32::new(residual[colour.index()], residual[3 + colour.index()]);
+                        *value = Complex32::new(*re, *im) + residual * CORRECTION_SHARE;
+                    }
+                }
             }
         });
     }
