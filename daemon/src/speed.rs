@@ -146,8 +146,8 @@ impl Estimate {
         Some(format!("for {size} the processor takes {processor_ms:.0} ms (--backend cpu), this GPU {gpu_ms:.0} ms"))
     }
 
-    /// The time of a frame of `size`: what surrounds it on the panel, and a GPU, take some of it for each frame, the rest
-    /// goes with the pixels.
+    /// The time of a frame of `size`: some of it goes with frames, as what a GPU takes to begin, the rest with the
+    /// pixels.
     pub(crate) fn frame_time(&self, size: Resolution) -> TimeNs {
         let ([smaller, larger], [smaller_s, larger_s]) = (self.timed.map(|size| size.pixels() as f64), self.seconds);
         // Not less for a frame that took longer, nor more for each pixel than all of them took.

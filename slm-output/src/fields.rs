@@ -127,7 +127,7 @@ pub struct LevelsFrame {
 pub(crate) struct SurroundId(u64);
 
 impl SurroundId {
-    /// One that there has not been.
+    /// A number not given before.
     pub(crate) fn new() -> Self {
         static NEXT: AtomicU64 = AtomicU64::new(0);
         Self(NEXT.fetch_add(1, Ordering::Relaxed))

@@ -205,9 +205,9 @@ impl PanelEncoder {
     }
 
     /// Encodes three patterns into `frame`: each phase in radians `[height, width]`, row-major, nominally in [0, 2π);
-    /// phases within ±50 turns are wrapped. What is around them is written where the frame does not have it yet from an
-    /// earlier pattern. The threads of the rayon pool that this is called in share the rows; called
-    /// from one of them it does not allocate.
+    /// phases within ±50 turns are wrapped. What is around them is written where the frame does not have it yet from
+    /// an earlier pattern. The threads of the rayon pool that this is called in share the rows; called from one of them
+    /// it does not allocate.
     ///
     /// # Panics
     /// Where a pattern or the frame has another size than the encoder was made for.

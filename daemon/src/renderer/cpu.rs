@@ -51,10 +51,11 @@ impl CpuRenderer {
     ) -> Result<Self, Failure> {
         let resolution = encoder.pattern_resolution();
         let engine = CpuEngine::new(weights, bench, resolution, precision).map_err(super::failure)?;
-        let levels = LevelsFrame::new(encoder.layout());
         let (hologram, pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
         let pattern_bytes: usize = Colour::ALL.map(|colour| size_of_val(pattern.plane(colour))).iter().sum();
-        let moved = [size_of_val(&*hologram.field) + pattern_bytes, pattern_bytes + size_of_val(levels.samples())];
+        // What is around the pattern is written once.
+        let levels_bytes = Colour::ALL.len() * resolution.pixels() * size_of::<u16>();
+        let moved = [size_of_val(&*hologram.field) + pattern_bytes, pattern_bytes + levels_bytes];
         let after_network = AFTER_NETWORK.into_iter().zip(moved).map(|(name, bytes)| StageTiming {
             name: name.to_owned(),
             duration: Duration::ZERO,
@@ -72,7 +73,7 @@ impl CpuRenderer {
             pupil: weights.trained_pupils(bench)[0],
             hologram: ComplexHologram::dark(nothing),
             pattern: PhasePattern::flat(nothing),
-            levels,
+            levels: LevelsFrame::new(encoder.layout()),
             rendered: Ok(Rendered::default()),
             durations: Default::default(),
         };
@@ -207,7 +208,7 @@ mod tests {
         assert_ne!(shown[0], shown[1], "pupils are told apart");
         let [.., double_phase, panel_levels] = renderer.timings() else { panic!("two stages follow the network") };
         assert_eq!((&*double_phase.name, double_phase.bytes), ("double phase", 3 * (8 + 4) * 34 * 22));
-        assert_eq!((&*panel_levels.name, panel_levels.bytes), ("panel levels", 3 * (4 * 34 * 22 + 2 * 40 * 25)));
+        assert_eq!((&*panel_levels.name, panel_levels.bytes), ("panel levels", 3 * (4 + 2) * 34 * 22));
     }
 
     #[test]

@@ -177,12 +177,12 @@ impl Task for Row<'_> {
 #[derive(Clone, Default)]
 struct Places {
     /// Row and column of the upper left one.
-    corners: [[i32; MOST_TAPS]; 2],
+    corners: [[u32; MOST_TAPS]; 2],
     /// What the upper left one, the upper right one and the lower ones are worth.
     shares: [[f32; MOST_TAPS]; 4],
 }
 
-/// [`TAPS`] in whole vectors.
+/// [`TAPS`] in whole vectors of any length.
 const MOST_TAPS: usize = TAPS.next_power_of_two();
 /// Where the kernel has its taps, from the pixel on.
 const ROW_OF: [f32; MOST_TAPS] = [-1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
@@ -195,7 +195,7 @@ impl Places {
         let (width, height) = (map.width as f32, map.height as f32);
         // Four pixels of the border: the last one of the row above the first one, the first one of the next row, and
         // those below.
-        let outside = [0, (map.row_len / map.stride - 1) as i32];
+        let outside = [0, (map.row_len / map.stride - 1) as u32];
         let mut offsets_of = [[0.0; MOST_TAPS]; 2];
         for first in (0..MOST_TAPS).step_by(S::LANES) {
             let vector = |at: usize| if at < offsets.len() { simd.read(&offsets[at..]) } else { simd.splat(f32::NAN) };
@@ -212,7 +212,7 @@ impl Places {
             let (top, left) = (if inside { y.floor() } else { 0.0 }, if inside { x.floor() } else { 0.0 });
             let (lower, right) = (if inside { y - top } else { 0.0 }, if inside { x - left } else { 0.0 });
             // SAFETY: both are whole numbers from −1 to the side of a map.
-            let corner = unsafe { [top.to_int_unchecked::<i32>() + 1, left.to_int_unchecked::<i32>() + 1] };
+            let corner = unsafe { [top, left].map(|place| (place.to_int_unchecked::<i32>() + 1) as u32) };
             for (corners, (corner, outside)) in corners.iter_mut().zip(corner.into_iter().zip(outside)) {
                 corners[k] = if inside { corner } else { outside };
             }
@@ -248,7 +248,7 @@ fn sample<S: Simd>(
         assert!(upper + row_len + 2 * stride <= pixels.len());
         let shares = [shares[0][k], shares[1][k], shares[2][k], shares[3][k]];
         for channel in (0..stride).step_by(S::LANES) {
-            // SAFETY: channel + LANES ≤ stride; two pixels of `stride` lie in `pixels` at `upper` and a row after it, as
+            // SAFETY: channel + LANES ≤ stride; two pixels lie in `pixels` at `upper` and a row after it, as
             // asserted above, the panels hold a row of so many and `values` one.
             unsafe {
                 let upper = pixels.as_ptr().add(upper + channel);
@@ -298,25 +298,25 @@ mod tests {
         const CHANNELS: usize = 3;
         const BIAS: f32 = 0.75;
         for products in Products::available() {
-            // What every sample of a map is, and every offset.
+            // What every sample of a map is, and every offset. No column of the border is one too many.
             let first_output = |sample: f32, offset: f32| {
-                let mut map = FeatureMap::new(6, 5, CHANNELS, products.set());
+                let mut map = FeatureMap::new(8, 5, CHANNELS, products.set());
                 let (stride, width) = (map.stride, map.width);
                 map.rows_mut().for_each(|row| {
                     row[stride..][..width * stride]
                         .chunks_exact_mut(stride)
                         .for_each(|pixel| pixel[..CHANNELS].fill(sample));
                 });
-                let mut output = FeatureMap::new(6, 5, 1, products.set());
+                let mut output = FeatureMap::new(8, 5, 1, products.set());
                 let weight = |_, _, _| 1.0;
-                let mut conv = DeformableConv::new(CHANNELS, 6, &[BIAS], weight, Epilogue::None, 0.1, products);
+                let mut conv = DeformableConv::new(CHANNELS, 8, &[BIAS], weight, Epilogue::None, 0.1, products);
                 conv.offset_conv.fill(&[0, 1, 2], [offset; OFFSET_CHANNELS].into_iter(), |_, _, _| 0.0);
                 conv.run(&map, &mut output);
-                (0..5).flat_map(|y| (0..6).map(move |x| (x, y))).map(|(x, y)| output.pixel(x, y)[0]).collect::<Vec<_>>()
+                (0..5).flat_map(|y| (0..8).map(move |x| (x, y))).map(|(x, y)| output.pixel(x, y)[0]).collect::<Vec<_>>()
             };
             for (sample, offset) in [(1.0, 7.0), (1.0, -7.5), (1.0, 1e30), (1.0, f32::NEG_INFINITY), (f32::NAN, 0.0)] {
                 let found = first_output(sample, offset);
-                assert_eq!(found, [BIAS; 6 * 5], "{} of {sample} at {offset}", products.name());
+                assert_eq!(found, [BIAS; 8 * 5], "{} of {sample} at {offset}", products.name());
             }
             assert_ne!(first_output(1.0, 0.5)[0], BIAS, "the comparison is blind");
         }

@@ -216,6 +216,7 @@ impl FeatureMap {
     /// Writes `base` and a share of this correction of one colour to `field` [height, width]; the map's channels are
     /// three real parts and three imaginary ones.
     pub(super) fn correct(&self, base: &ColumnBlocks, colour: Colour, field: &mut [Complex32]) {
+        assert_eq!(base.parts(), 2, "a field is complex");
         let (width, lanes) = (self.width, base.row_len() / base.parts());
         // As in `write_channels`, a block of columns after another.
         field.par_chunks_mut(BAND * width).enumerate().for_each(|(band, rows)| {

@@ -173,8 +173,8 @@ impl Task for TakeOutputs<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { map, first, outputs, planes } = self;
-        // So many rows of a pixel's channels stay in the cache while these are taken, as many as a vector has lanes at a
-        // time: what is written then lies beside one another.
+        // Eight rows at a time, so that their channels stay in the cache while vector after vector of them is taken,
+        // and what is written lies together.
         const ROWS: usize = 8;
         let plane_len = map.height * S::LANES;
         for first_row in (0..map.height).step_by(ROWS) {
