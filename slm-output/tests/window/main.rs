@@ -6,6 +6,8 @@
 mod bench;
 mod compositor;
 mod fails_dark;
+mod stamped;
+mod stamping_compositor;
 mod wayland;
 mod x11;
 mod x11_server;

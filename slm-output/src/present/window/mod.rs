@@ -188,7 +188,7 @@ impl Road {
 
 /// Puts pictures on a window: 8 bits each of blue, green, red and nothing for each pixel, row-major, as they are.
 trait Draw: Send {
-    /// Writes a picture, which is not the one that was presented last.
+    /// Writes a picture, which may be on the monitor.
     fn write(&mut self, picture: usize, pixels: &[u8]) -> Result<(), PanelFault>;
 
     /// Queues a picture for the next refresh.
@@ -245,6 +245,8 @@ pub struct WindowPanel {
     repeated: bool,
     /// Position of the next refresh in its colour frame.
     next_refresh: usize,
+    /// Its picture is written: it was presented before, and never came on the monitor.
+    skipped: bool,
     on_its_way: Option<OnItsWay>,
     t_next: TimeNs,
     pixels: Vec<u8>,
@@ -271,9 +273,12 @@ impl std::fmt::Debug for Open {
 #[derive(Clone, Copy, Debug)]
 struct OnItsWay {
     frame: Option<FrameTag>,
-    field: usize,
+    /// Position of the refresh in its colour frame.
+    refresh: usize,
     repeated: bool,
     since: TimeNs,
+    /// What is known of its coming; where that time is still to come, it is reported then.
+    came: Option<Presented>,
 }
 
 impl WindowPanel {
@@ -327,6 +332,7 @@ impl WindowPanel {
             coming: flat.clone(),
             repeated: false,
             next_refresh: 0,
+            skipped: false,
             on_its_way: None,
             t_next: TimeNs(0),
             pixels: vec![0; PIXEL_BYTES * layout.video_resolution().pixels()],
@@ -396,6 +402,7 @@ impl WindowPanel {
         self.reported = None;
         self.repeated = false;
         self.next_refresh = 0;
+        self.skipped = false;
     }
 
     /// At a colour frame's start, takes what is newest.
@@ -405,11 +412,12 @@ impl WindowPanel {
             self.repeated = false;
             return;
         }
-        self.repeated = self.frame.is_some();
+        self.repeated = self.frame.is_some() && self.reported == self.frame;
         if frames.update() {
             std::mem::swap(&mut self.coming, frames.current_mut());
             self.frame = Some(self.coming.tag());
             self.repeated = false;
+            self.skipped = false;
         }
     }
 
@@ -426,7 +434,7 @@ impl WindowPanel {
         };
         let is_new =
             self.frame.is_some() && !self.repeated && self.next_refresh.is_multiple_of(self.refreshes_per_plane);
-        if is_new {
+        if is_new && !self.skipped {
             // Once it is reported, the levels are where reported ones are.
             let levels = if self.reported == self.frame { &self.shown } else { &self.coming };
             write_pixels(levels, plane * self.refreshes_per_plane, &mut self.pixels);
@@ -436,12 +444,9 @@ impl WindowPanel {
         if let Some(timeline) = &mut open.timeline {
             timeline.present();
         }
-        self.on_its_way = Some(OnItsWay {
-            frame: self.frame,
-            field: self.next_refresh * self.fields_per_refresh,
-            repeated: self.repeated,
-            since: now,
-        });
+        let (frame, refresh, repeated) = (self.frame, self.next_refresh, self.repeated);
+        self.on_its_way = Some(OnItsWay { frame, refresh, repeated, since: now, came: None });
+        self.skipped = false;
         self.next_refresh = (self.next_refresh + 1) % (self.planes * self.refreshes_per_plane);
         Ok(())
     }
@@ -454,7 +459,7 @@ impl WindowPanel {
         self.reported = picture.frame;
         presented(PresentedRefresh {
             frame: picture.frame,
-            field: picture.field,
+            field: picture.refresh * self.fields_per_refresh,
             repeated: picture.repeated,
             t_present: came.t_present,
             provenance: came.provenance,
@@ -462,25 +467,39 @@ impl WindowPanel {
         });
     }
 
-    /// Reports what the display server says has come on the monitor.
-    fn collect(&mut self, presented: &mut dyn FnMut(PresentedRefresh)) -> Result<(), PanelFault> {
+    /// Takes in what the display server says has come on the monitor.
+    fn collect(&mut self) -> Result<(), PanelFault> {
         loop {
             let Some(open) = &mut self.open else { return Err(PanelFault::WindowLost) };
             open.watched.check()?;
             let Some(timeline) = &mut open.timeline else { return Ok(()) };
             let Some(completion) = open.watched.completion() else { return Ok(()) };
-            let Some(picture) = self.on_its_way else { continue };
+            let Some(picture) = &mut self.on_its_way else { continue };
             match timeline.complete(completion, host_now()) {
-                Outcome::NotThis => continue,
-                Outcome::Skipped => self.t_next = host_now(),
+                Outcome::NotThis => {}
+                Outcome::Skipped => {
+                    self.t_next = host_now();
+                    self.next_refresh = picture.refresh;
+                    self.skipped = true;
+                    self.on_its_way = None;
+                }
                 Outcome::Shown(came) => {
                     open.lead.learn(open.t_refresh, came.t_present);
                     open.t_refresh = came.t_present;
-                    self.t_next = open.lead.t_choose(came.t_present);
-                    self.report(picture, came, presented);
+                    picture.came = Some(came);
                 }
             }
-            self.on_its_way = None;
+        }
+    }
+
+    /// Reports the picture that has come on the monitor by `now`, if one has.
+    fn report_due(&mut self, now: TimeNs, presented: &mut dyn FnMut(PresentedRefresh)) {
+        let is_due = |picture: &mut OnItsWay| picture.came.is_some_and(|came| came.t_present <= now);
+        if let Some(picture) = self.on_its_way.take_if(is_due)
+            && let (Some(came), Some(open)) = (picture.came, &self.open)
+        {
+            self.t_next = open.lead.t_choose(came.t_present);
+            self.report(picture, came, presented);
         }
     }
 }
@@ -505,12 +524,14 @@ impl Presenter for WindowPanel {
         presented: &mut dyn FnMut(PresentedRefresh),
     ) -> Result<(), PanelFault> {
         let mut work = || {
-            self.collect(presented)?;
+            self.collect()?;
+            // What came arrived after `now`, perhaps.
+            self.report_due(host_now(), presented);
             if let Some(picture) = self.on_its_way {
                 if now - picture.since > STUCK {
                     return Err(PanelFault::WindowLost);
                 }
-                self.t_next = picture.since + STUCK;
+                self.t_next = picture.came.map_or(picture.since + STUCK, |came| came.t_present);
                 return Ok(());
             }
             if now < self.t_next {

@@ -4,18 +4,18 @@
 //! What a compositor does not tell is not watched: its gamma ramps, power-saving, and notifications over a fullscreen
 //! window.
 
-use std::fs;
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
+use std::{fs, io};
 
-use holod_calibration::{Resolution, TimeNs};
+use holod_calibration::{Resolution, TimeNs, host_now};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{MemfdFlags, ftruncate, memfd_create};
-use wayland_client::backend::ObjectId;
+use wayland_client::backend::{ObjectId, ReadEventsGuard, WaylandError};
 use wayland_client::protocol::{
     wl_buffer, wl_callback, wl_compositor, wl_output, wl_pointer, wl_registry, wl_seat, wl_shm, wl_shm_pool, wl_surface,
 };
@@ -37,6 +37,10 @@ use crate::present::drm::Edid;
 const PATIENCE: Duration = Duration::from_secs(2);
 /// A picture is written to one while the compositor may still read the other.
 const COPIES: usize = 2;
+/// How long after drawing a picture a compositor tells when it came on the monitor, if it ever does: at 24 Hz some 80 ms.
+const TIME_WAIT: TimeNs = TimeNs(200_000_000);
+/// How often the watcher looks round where nothing happens.
+const LOOK_EVERY: TimeNs = TimeNs(1_000_000_000);
 
 /// Opens the panel's window on the compositor at `socket`, with room for `pictures`. It is on its monitor once the
 /// first picture is: see [`Watched::is_placed`].
@@ -113,6 +117,7 @@ fn watch(
     loop {
         queue.dispatch_pending(&mut view).ok()?;
         view.ask_for_logical_sizes(&handle);
+        view.completed.extend(view.answers.waited(host_now()));
         for completion in view.completed.drain(..) {
             watcher.completed(completion);
         }
@@ -124,7 +129,10 @@ fn watch(
         }
         queue.flush().ok()?;
         let Some(guard) = queue.prepare_read() else { continue };
-        let timeout = Timespec { tv_sec: 1, tv_nsec: 0 };
+        let now = host_now();
+        let patience =
+            view.answers.t_waited().map_or(LOOK_EVERY, |t_waited| (t_waited - now).clamp(TimeNs(0), LOOK_EVERY));
+        let timeout = Timespec { tv_sec: patience.0 / 1_000_000_000, tv_nsec: patience.0 % 1_000_000_000 };
         let mut fds = [
             PollFd::from_borrowed_fd(guard.connection_fd(), PollFlags::IN),
             PollFd::from_borrowed_fd(watcher.order().as_fd(), PollFlags::IN),
@@ -138,8 +146,17 @@ fn watch(
             return Some(PanelFault::WindowLost);
         }
         if readable {
-            guard.read().ok()?;
+            take_in(guard).ok()?;
         }
+    }
+}
+
+/// Reads what the compositor has sent. What has come may be half a message, or one to the library alone, which then
+/// says that nothing came.
+fn take_in(guard: ReadEventsGuard) -> Result<(), WaylandError> {
+    match guard.read() {
+        Err(WaylandError::Io(why)) if why.kind() == io::ErrorKind::WouldBlock => Ok(()),
+        read => read.map(drop),
     }
 }
 
@@ -155,8 +172,6 @@ struct View {
     outputs: Vec<Output>,
     /// Presentation times are of the monotonic clock.
     times_are_monotonic: bool,
-    /// It has told one.
-    tells_times: bool,
     /// The window's size and states as they were last configured.
     size: (i32, i32),
     states: Vec<u32>,
@@ -167,7 +182,98 @@ struct View {
     entered: Vec<ObjectId>,
     /// The window has been all of its monitor's picture.
     placed: bool,
+    answers: Answers,
     completed: Vec<Completion>,
+}
+
+/// Makes one completion for each picture of what a compositor says: that it has drawn it, and, where it can, when it
+/// came on the monitor, or that it never did. The first may be said long before the picture is seen, so it is taken
+/// only of a compositor that tells no times. No clock is read here.
+#[derive(Debug, Default)]
+struct Answers {
+    complete_by: CompleteBy,
+    /// Number of the last picture that is complete.
+    completed: u32,
+}
+
+/// What completes a picture.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+enum CompleteBy {
+    /// It is not known yet, and nothing was drawn.
+    #[default]
+    Unknown,
+    /// It is not known yet, and the time of this picture is waited for.
+    Awaiting {
+        serial: u32,
+        t_waited: TimeNs,
+    },
+    Drawing,
+    Time,
+}
+
+impl Answers {
+    /// Picture `serial` was drawn at `now`.
+    fn drawn(&mut self, serial: u32, now: TimeNs) -> Option<Completion> {
+        match self.complete_by {
+            CompleteBy::Unknown | CompleteBy::Awaiting { .. } => {
+                self.complete_by = CompleteBy::Awaiting { serial, t_waited: now + TIME_WAIT };
+                None
+            }
+            CompleteBy::Drawing => self.once(without_time(serial, Shown::Copied)),
+            CompleteBy::Time => None,
+        }
+    }
+
+    /// A picture came on the monitor.
+    fn presented(&mut self, completion: Completion) -> Option<Completion> {
+        self.complete_by = CompleteBy::Time;
+        self.once(completion)
+    }
+
+    /// No time is told of picture `serial`: it was never seen, or the compositor tells none of any.
+    fn discarded(&mut self, serial: u32) -> Option<Completion> {
+        match self.complete_by {
+            CompleteBy::Time => self.once(without_time(serial, Shown::Skipped)),
+            CompleteBy::Awaiting { .. } => self.give_times_up(),
+            CompleteBy::Unknown => {
+                self.complete_by = CompleteBy::Drawing;
+                None
+            }
+            CompleteBy::Drawing => None,
+        }
+    }
+
+    /// Until when a time is waited for.
+    fn t_waited(&self) -> Option<TimeNs> {
+        match self.complete_by {
+            CompleteBy::Awaiting { t_waited, .. } => Some(t_waited),
+            _ => None,
+        }
+    }
+
+    /// It is `now`.
+    fn waited(&mut self, now: TimeNs) -> Option<Completion> {
+        self.t_waited().filter(|t_waited| now >= *t_waited).and_then(|_| self.give_times_up())
+    }
+
+    fn give_times_up(&mut self) -> Option<Completion> {
+        let drawn = std::mem::replace(&mut self.complete_by, CompleteBy::Drawing);
+        let CompleteBy::Awaiting { serial, .. } = drawn else { return None };
+        self.once(without_time(serial, Shown::Copied))
+    }
+
+    fn once(&mut self, completion: Completion) -> Option<Completion> {
+        let further = completion.serial.wrapping_sub(self.completed);
+        if further == 0 || further > u32::MAX / 2 {
+            return None;
+        }
+        self.completed = completion.serial;
+        Some(completion)
+    }
+}
+
+fn without_time(serial: u32, shown: Shown) -> Completion {
+    Completion { serial, t_present: TimeNs(0), refresh_count: 0, shown }
 }
 
 /// A monitor, as far as the compositor has described it.
@@ -590,20 +696,16 @@ impl Dispatch<wp_presentation_feedback::WpPresentationFeedback, u32> for View {
         let completion = match event {
             Event::Presented { tv_sec_hi, tv_sec_lo, tv_nsec, seq_hi, seq_lo, flags, .. } => {
                 let time = Some((joined(tv_sec_hi, tv_sec_lo), tv_nsec)).filter(|_| view.times_are_monotonic);
-                presented(serial, time, joined(seq_hi, seq_lo), flags)
+                view.answers.presented(presented(serial, time, joined(seq_hi, seq_lo), flags))
             }
-            // One that never tells a time discards all.
-            Event::Discarded if view.tells_times => {
-                Completion { serial, t_present: TimeNs(0), refresh_count: 0, shown: Shown::Skipped }
-            }
-            _ => return,
+            Event::Discarded => view.answers.discarded(serial),
+            _ => None,
         };
-        view.tells_times = true;
-        view.completed.push(completion);
+        view.completed.extend(completion);
     }
 }
 
-/// A compositor asks for the next picture once it has drawn one. Where it tells no times, that is all that it says.
+/// A compositor asks for the next picture once it has drawn one.
 impl Dispatch<wl_callback::WlCallback, u32> for View {
     fn event(
         view: &mut Self,
@@ -613,11 +715,8 @@ impl Dispatch<wl_callback::WlCallback, u32> for View {
         _: &Connection,
         _: &QueueHandle<Self>,
     ) {
-        if let wl_callback::Event::Done { .. } = event
-            && !view.tells_times
-        {
-            let (t_present, refresh_count) = (TimeNs(0), 0);
-            view.completed.push(Completion { serial, t_present, refresh_count, shown: Shown::Copied });
+        if let wl_callback::Event::Done { .. } = event {
+            view.completed.extend(view.answers.drawn(serial, host_now()));
         }
     }
 }
@@ -679,7 +778,70 @@ delegate_noop!(View: ignore zxdg_output_manager_v1::ZxdgOutputManagerV1);
 
 #[cfg(test)]
 mod tests {
+    use std::io::Write as _;
+
     use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    fn flipped(serial: u32) -> Completion {
+        Completion { serial, t_present: TimeNs(16 * MS), refresh_count: 1, shown: Shown::Flipped }
+    }
+
+    #[test]
+    fn of_a_compositor_that_tells_times_a_picture_is_complete_once_by_its_own_time() {
+        let mut answers = Answers::default();
+        assert_eq!(answers.drawn(1, TimeNs(0)), None);
+        assert_eq!(answers.waited(TimeNs(199 * MS)), None);
+        assert_eq!(answers.presented(flipped(1)), Some(flipped(1)));
+        assert_eq!(answers.t_waited(), None);
+        assert_eq!([answers.drawn(2, TimeNs(0)), answers.presented(flipped(1))], [None, None]);
+        assert_eq!(answers.presented(flipped(2)), Some(flipped(2)));
+        assert_eq!(answers.discarded(3), Some(without_time(3, Shown::Skipped)));
+        assert_eq!(answers.presented(flipped(3)), None);
+    }
+
+    #[test]
+    fn of_one_that_tells_none_a_picture_is_complete_once_it_is_drawn() {
+        let copied = |serial| Some(without_time(serial, Shown::Copied));
+        // It says nothing of the first, says that there is no time of it before it is drawn, or after.
+        let mut silent = Answers::default();
+        assert_eq!(silent.drawn(1, TimeNs(0)), None);
+        assert_eq!([silent.waited(TimeNs(199 * MS)), silent.waited(TimeNs(200 * MS))], [None, copied(1)]);
+        let mut before = Answers::default();
+        assert_eq!([before.discarded(1), before.drawn(1, TimeNs(0))], [None, copied(1)]);
+        let mut after = Answers::default();
+        assert_eq!([after.drawn(1, TimeNs(0)), after.discarded(1)], [None, copied(1)]);
+        for mut answers in [silent, before, after] {
+            assert_eq!([answers.drawn(2, TimeNs(0)), answers.discarded(2)], [copied(2), None]);
+            // One that was only slow: its times are taken from then on, and of no picture twice.
+            assert_eq!(answers.presented(flipped(2)), None);
+            assert_eq!([answers.drawn(3, TimeNs(0)), answers.presented(flipped(3))], [None, Some(flipped(3))]);
+        }
+    }
+
+    #[test]
+    fn numbers_of_pictures_may_begin_again() {
+        let mut answers = Answers { complete_by: CompleteBy::Time, completed: u32::MAX };
+        assert_eq!(answers.presented(flipped(u32::MAX - 1)), None);
+        assert_eq!(answers.presented(flipped(0)), Some(flipped(0)));
+    }
+
+    #[test]
+    fn half_a_message_and_one_to_the_library_alone_are_no_broken_connection() {
+        let (client, mut compositor) = UnixStream::pair().unwrap();
+        let connection = Connection::from_socket(client).unwrap();
+        let mut read = |bytes: &[u8]| {
+            compositor.write_all(bytes).unwrap();
+            take_in(connection.prepare_read().expect("nothing is left to be dispatched"))
+        };
+        // wl_display.delete_id of an object that was never there, first whole, then its first half.
+        let message = [1u32, 12 << 16 | 1, 77].map(u32::to_ne_bytes).concat();
+        assert!(read(&message).is_ok());
+        assert!(read(&message[..6]).is_ok());
+        drop(compositor);
+        assert!(take_in(connection.prepare_read().unwrap()).is_err(), "a compositor that has gone");
+    }
 
     #[test]
     fn only_the_display_controllers_own_time_is_taken_for_a_flip() {
