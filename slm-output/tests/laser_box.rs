@@ -279,6 +279,34 @@ fn faults_of_the_box_are_heard_of_by_their_own_names() {
 }
 
 #[test]
+fn a_box_that_goes_dark_by_itself_is_told_to_have_done_so_when_it_did() {
+    let mut laser = BoxProcess::start(&OTHER_CLOCK);
+    let mut host = laser.armed(&host_program());
+    let mut told = Vec::new();
+    let now = host_now();
+    let window = LitWindow { colour: Colour::Green, t_on: now + TimeNs(5 * MS), t_off: now + TimeNs(90 * MS) };
+    assert_eq!(host.light(window, now).unwrap(), None);
+    std::thread::sleep(Duration::from_millis(30));
+    host.poll(host_now(), &mut |event| told.push(event)).unwrap();
+    laser.tell("interlock open");
+    let log = laser.dark_log();
+    std::thread::sleep(Duration::from_millis(60));
+    host.poll(host_now(), &mut |event| told.push(event)).unwrap();
+    let ends = |events: &[BoxEvent]| {
+        let off = edges(events).last().filter(|edge| !edge.on).map(|edge| edge.t);
+        let dark = events.iter().rev().find_map(|event| match event {
+            BoxEvent::Dark { t, reason: DarkReason::Interlock } => Some(*t),
+            _ => None,
+        });
+        [off.expect("a laser that was lit goes out"), dark.expect("the interlock makes dark")]
+    };
+    for (told, was) in ends(&told).into_iter().zip(ends(&log)) {
+        // As well as the clocks are known.
+        assert!((told - was).0.abs() < 5 * MS, "{told:?} {was:?}");
+    }
+}
+
+#[test]
 fn a_box_whose_interlock_is_open_is_not_armed() {
     let mut laser = BoxProcess::start(&[]);
     laser.tell("interlock open");

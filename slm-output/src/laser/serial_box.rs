@@ -388,8 +388,9 @@ impl SerialBox {
                     (refusal, _) => Err(LaserError::Refused { command: sent.command, refusal }),
                 }
             }
-            Message::Dark { reason, .. } => {
-                self.model.set_dark(reason, now);
+            Message::Dark { t, reason } => {
+                let t_dark = self.host_time(t, t_heard).unwrap_or(t_heard).min(t_heard);
+                self.model.set_dark(reason, t_dark);
                 Ok(())
             }
             Message::Booted => {
@@ -402,8 +403,13 @@ impl SerialBox {
 
     /// When the box did what it answers to, between sending and hearing.
     fn done_at(&self, answer: &Answer<'_>, t_sent: TimeNs, t_heard: TimeNs) -> TimeNs {
-        let done = answer.t().zip(self.box_clock.offset_at(t_heard));
-        done.map_or(t_heard, |(t, offset)| nanoseconds(t) - TimeNs(offset.middle_ns())).min(t_heard).max(t_sent)
+        let done = answer.t().and_then(|t| self.host_time(t, t_heard));
+        done.unwrap_or(t_heard).min(t_heard).max(t_sent)
+    }
+
+    /// The box's time `t`, of which was heard at `t_heard`, as the host's, where it is known how the two go together.
+    fn host_time(&self, t: TimeUs, t_heard: TimeNs) -> Option<TimeNs> {
+        self.box_clock.offset_at(t_heard).map(|offset| nanoseconds(t) - TimeNs(offset.middle_ns()))
     }
 
     /// Has the model do what the box did at `t`.
