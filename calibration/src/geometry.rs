@@ -7,6 +7,9 @@ use crate::{Colour, Dioptres, Metres, PerColour, PupilDiameter, Resolution};
 /// The panel sits in the front focal plane of an eyepiece of focal length f, so an image plane at distance u from the
 /// panel appears to the eye at vergence e_d = u/f² (Newton's form of the lens equation) and one panel pixel subtends
 /// pitch/f.
+///
+/// Behind a relay of magnification M the panel's image has pixels of M·pitch, and its image planes lie M²·u from it. The
+/// eye sees what it would see of the panel itself through an eyepiece of f/M, so that is the focal length here.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DisplayGeometry {
     /// Panel pixels.
@@ -15,7 +18,7 @@ pub struct DisplayGeometry {
     pub pixel_pitch: Metres,
     /// Laser wavelengths.
     pub wavelengths: PerColour<Metres>,
-    /// Focal length of the eyepiece.
+    /// Focal length of the eyepiece, over the magnification of the relay before it.
     pub eyepiece_focal_length: Metres,
     /// Vergence of the farthest depth that the display shows, 0 for infinity.
     pub depth_far: Dioptres,

@@ -426,6 +426,35 @@ fn a_panel_that_lights_its_own_lasers_shows_each_colour_in_its_channel() {
 }
 
 #[test]
+fn behind_a_relay_the_panel_is_seen_as_behind_another_eyepiece() {
+    let key = "eyepiece_focal_length_mm = 40.0";
+    let with = |keys: &str| Rig::parse(&changed(&[(key, keys)]), Path::new(""));
+    let plain = with(key).unwrap();
+    assert_eq!(plain.relay_magnification, 1.0);
+    let rig = with(&format!("{key}\nrelay_magnification = 0.75")).unwrap();
+    // By hand: 2.5 dpt lie 4 mm from the panel's image, which is 4 mm/0.75² from the panel; a pixel of the image is 6 µm.
+    let depth = Dioptres(2.5);
+    assert!((rig.geometry.image_distance(depth).0 - 4e-3 / 0.5625).abs() < 1e-12);
+    assert!((rig.geometry.pixel_angle_rad() - 6e-6 / 40e-3).abs() < 1e-15);
+    assert_eq!(rig.geometry.pixel_pitch, plain.geometry.pixel_pitch, "the stop goes by the panel's own");
+    let text = rig.meaning().to_string();
+    assert!(text.contains("0.75 times as large") && text.contains("53.33 mm"), "{text}");
+    assert!(!plain.meaning().to_string().contains("times as large"));
+    assert_eq!(rig.differences(&plain), ["optics.relay_magnification"]);
+    let other = with("eyepiece_focal_length_mm = 41.0\nrelay_magnification = 0.75").unwrap();
+    assert_eq!(other.differences(&rig), ["optics.eyepiece_focal_length_mm"]);
+
+    let faults = |keys: &str| with(keys).expect_err("a fault").faults;
+    let percent = faults(&format!("{key}\nrelay_magnification = 75"));
+    assert_eq!(percent.len(), 1, "{percent:?}");
+    assert_eq!(percent[0].key, "optics.relay_magnification");
+    assert!(percent[0].to_string().contains("looks like percent: write 0.75"), "{percent:?}");
+    let far = faults("eyepiece_focal_length_mm = 200.0\nrelay_magnification = 0.25");
+    assert_eq!((far.len(), far[0].key.as_str()), (1, "optics.relay_magnification"), "{far:?}");
+    assert!(far[0].found.contains("800 mm") && far[0].expected.contains("500 mm"), "{far:?}");
+}
+
+#[test]
 fn a_panel_may_lie_in_a_larger_video_frame() {
     let with =
         |keys: &str| Rig::parse(&changed(&[("refresh_hz = ", &format!("{keys}\nrefresh_hz = "))]), Path::new(""));

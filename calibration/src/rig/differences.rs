@@ -9,7 +9,7 @@ impl Rig {
     /// spellings as `optics.depth_far` and `optics.depth_near`. Comments are no difference.
     pub fn differences(&self, other: &Self) -> Vec<&'static str> {
         // Named one by one, so that a new field must be thought of here.
-        let Self { name, panel, geometry, lasers, tracker, model, provenance: _ } = self;
+        let Self { name, panel, geometry, relay_magnification, lasers, tracker, model, provenance: _ } = self;
         let Panel {
             refresh_hz,
             mode,
@@ -29,6 +29,9 @@ impl Rig {
         } = panel;
         let DisplayGeometry { resolution, pixel_pitch, wavelengths, eyepiece_focal_length, depth_far, depth_near } =
             geometry;
+        // The relay is in both, up to what division rounds off.
+        let theirs = other.geometry.eyepiece_focal_length.0 * other.relay_magnification;
+        let same_eyepiece = (eyepiece_focal_length.0 * relay_magnification / theirs - 1.0).abs() < 1e-12;
         let Lasers {
             driver,
             power_mw,
@@ -70,7 +73,8 @@ impl Rig {
             ("panel.lut_file", *lut == other.panel.lut),
             ("panel.flatness_file", *flatness_rad == other.panel.flatness_rad),
             ("optics.wavelengths_nm", *wavelengths == other.geometry.wavelengths),
-            ("optics.eyepiece_focal_length_mm", *eyepiece_focal_length == other.geometry.eyepiece_focal_length),
+            ("optics.relay_magnification", *relay_magnification == other.relay_magnification),
+            ("optics.eyepiece_focal_length_mm", same_eyepiece),
             ("optics.depth_far", *depth_far == other.geometry.depth_far),
             ("optics.depth_near", *depth_near == other.geometry.depth_near),
             ("lasers.driver", *driver == other.lasers.driver),

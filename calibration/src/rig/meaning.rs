@@ -504,6 +504,14 @@ fn notes(rig: &Rig) -> Vec<String> {
     if rig.panel.orientation != Orientation::Normal {
         notes.push(format!("pictures lie on the panel in the orientation {}", rig.panel.orientation.name()));
     }
+    if rig.relay_magnification != 1.0 {
+        notes.push(format!(
+            "the relay makes the panel's image {} times as large as the panel: all is computed as behind an eyepiece of \
+             {:.2} mm and a relay of 1",
+            rig.relay_magnification,
+            rig.geometry.eyepiece_focal_length.0 * 1e3
+        ));
+    }
     let longest = rig.geometry.longest();
     notes.push(format!(
         "the stop of the 4f relay is one for all colours: set it for {longest}, λ·F/2p = {:.2} mm wide for each \

@@ -40,6 +40,9 @@ pub struct Rig {
     pub panel: Panel,
     /// Wavelengths, eyepiece and depth range, with the panel's resolution and pitch.
     pub geometry: DisplayGeometry,
+    /// Size of the panel's image, which the relay puts into the eyepiece's front focal plane, over that of the panel.
+    /// The geometry has it: [`DisplayGeometry::eyepiece_focal_length`].
+    pub relay_magnification: f64,
     /// The light sources.
     pub lasers: Lasers,
     /// The eye tracker and what to do without it.
@@ -357,6 +360,7 @@ impl Default for Rig {
                 settle: TimeNs(2_000_000),
             },
             geometry: DisplayGeometry::DEFAULT,
+            relay_magnification: 1.0,
             lasers: Lasers {
                 driver: LaserDriver::Simulated,
                 power_mw: PerColour([1.0; 3]),

@@ -53,6 +53,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
         &[
             "wavelengths_nm",
             "eyepiece_focal_length_mm",
+            "relay_magnification",
             "depth_far_m",
             "depth_far_dpt",
             "depth_near_m",
@@ -117,6 +118,7 @@ pub const WAVELENGTH: Span =
     Span::new(380.0, 780.0, "nm").slips(&[("metres", 1e9), ("micrometres", 1e3), ("ångströms", 0.1)]);
 /// What `optics.eyepiece_focal_length_mm` may be.
 pub const FOCAL_LENGTH: Span = Span::new(5.0, 500.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
+const MAGNIFICATION: Span = Span::new(0.1, 10.0, "").slips(&[("percent", 1e-2)]);
 const DEPTH_M: Span = Span::new(1.0 / DEPTH_DPT.max, 100.0, "m").slips(&[("millimetres", 1e-3)]).or_infinite();
 /// What `optics.depth_far_dpt` and `optics.depth_near_dpt` may be.
 pub const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
@@ -190,12 +192,13 @@ fn read_rig<'a>(
     let timing = read_field_timing(reader, panel);
     let levels = read_levels(reader, panel, timing.map(|timing| timing.mode));
     let phase = read_phase(reader, panel, levels, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
-    let geometry = read_optics(reader, optics, pixels);
+    let optics = read_optics(reader, optics, pixels);
     let lasers = read_lasers(reader, lasers, timing, folder, &mut provenance);
     let tracker = read_tracker(reader, tracker, &|spec| read_spec(spec, folder));
     let model = read_model(reader, model, folder);
 
     let (timing, (bit_depth, packing), phase) = (timing?, levels?, phase?);
+    let (geometry, relay_magnification) = optics?;
     let panel = Panel {
         refresh_hz: timing.refresh_hz,
         mode: timing.mode,
@@ -213,7 +216,16 @@ fn read_rig<'a>(
         lut: phase.lut,
         flatness_rad: phase.flatness_rad,
     };
-    Some(Rig { name, panel, geometry: geometry?, lasers: lasers?, tracker: tracker?, model: model?, provenance })
+    Some(Rig {
+        name,
+        panel,
+        geometry,
+        relay_magnification,
+        lasers: lasers?,
+        tracker: tracker?,
+        model: model?,
+        provenance,
+    })
 }
 
 fn read_profile<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<&'static PanelProfile> {
@@ -567,9 +579,13 @@ fn read_optics<'a>(
     reader: &Reader<'a>,
     optics: Section<'a>,
     pixels: Option<(Resolution, Metres)>,
-) -> Option<DisplayGeometry> {
+) -> Option<(DisplayGeometry, f64)> {
     let wavelengths_nm = reader.numbers(optics, "wavelengths_nm", WAVELENGTH, PerColour([true; 3]));
     let focal_length_mm = reader.required_number(optics, "eyepiece_focal_length_mm", FOCAL_LENGTH);
+    let magnification = match reader.number(optics, "relay_magnification", MAGNIFICATION) {
+        None if !optics.has("relay_magnification") => Some(Found { value: 1.0, line: None }),
+        read => read,
+    };
     let depth_far = read_depth(reader, optics, ["depth_far_m", "depth_far_dpt"], DisplayGeometry::DEFAULT.depth_far);
     let depth_near =
         read_depth(reader, optics, ["depth_near_m", "depth_near_dpt"], DisplayGeometry::DEFAULT.depth_near);
@@ -596,14 +612,23 @@ fn read_optics<'a>(
     }
     let [Some(red), Some(green), Some(blue)] = wavelengths_nm.0 else { return None };
     let (resolution, pixel_pitch) = pixels?;
-    Some(DisplayGeometry {
+    let (focal_length_mm, magnification) = (focal_length_mm?.value, magnification?);
+    let from_panel_mm = focal_length_mm / magnification.value;
+    if !(FOCAL_LENGTH.min..=FOCAL_LENGTH.max).contains(&from_panel_mm) {
+        let found = format!("{}, which makes {} mm of the eyepiece", shown(magnification.value), shown(from_panel_mm));
+        let expected = format!("from {} to {} mm, seen from the panel", FOCAL_LENGTH.min, FOCAL_LENGTH.max);
+        let advice = "write the size of the panel's image over that of the panel".into();
+        reader.fault_in(optics, "relay_magnification", magnification.line, &found, &expected, advice);
+    }
+    let geometry = DisplayGeometry {
         resolution,
         pixel_pitch,
         wavelengths: PerColour([red, green, blue]).map(|wavelength_nm| Metres(wavelength_nm.value / 1e9)),
-        eyepiece_focal_length: Metres(focal_length_mm?.value / 1e3),
+        eyepiece_focal_length: Metres(from_panel_mm / 1e3),
         depth_far: depth_far?.value,
         depth_near: depth_near?.value,
-    })
+    };
+    Some((geometry, magnification.value))
 }
 
 /// One end of the depth range, in metres or in dioptres; `default` where the rig file gives neither.
