@@ -71,7 +71,7 @@ impl Rig {
         (red, green, blue)
     }
 
-    /// Focal length of the eyepiece, metres.
+    /// Focal length of the eyepiece over the magnification of the relay before it, metres.
     #[getter]
     fn eyepiece_focal_length_m(&self) -> f64 {
         self.rig.geometry.eyepiece_focal_length.0

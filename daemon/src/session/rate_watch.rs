@@ -24,6 +24,11 @@ impl RateWatch {
         self.told = now - t >= WATCHED && frames_shown - frames >= FRAMES;
         self.told.then(|| (frames_shown - frames) as f64 / (now - t).seconds())
     }
+
+    /// What came until now says nothing of the rate: the panel was lost.
+    pub(super) fn begin_anew(&mut self) {
+        self.first = None;
+    }
 }
 
 #[cfg(test)]
@@ -42,6 +47,13 @@ mod tests {
         };
         let fast = told(20);
         assert!(matches!(fast[..], [(3_100, hz)] if (hz - 50.0).abs() < 0.1), "{fast:?}");
+        let mut watch = RateWatch::default();
+        for t_ms in [0, 2_000] {
+            assert_eq!(watch.reached_hz(1, TimeNs(t_ms * 1_000_000)), None);
+        }
+        watch.begin_anew();
+        let then = [(4_000, 2), (8_000, 202)].map(|(t_ms, frames)| watch.reached_hz(frames, TimeNs(t_ms * 1_000_000)));
+        assert_eq!(then, [None, Some(50.0)], "of the time after a panel was lost");
         let slow = told(4_000);
         assert!(matches!(slow[..], [(12_000, hz)] if (hz - 0.25).abs() < 1e-9), "{slow:?}");
     }

@@ -380,14 +380,24 @@ impl Watch<'_> {
 
     /// Says once how many frames a second are really reached.
     fn tell_rate(&mut self, now: TimeNs) {
+        if self.panel.lost().is_some() {
+            self.announced.rate.begin_anew();
+            return;
+        }
         let Some(reached_hz) = self.announced.rate.reached_hz(self.tally.frames_shown, now) else { return };
         let panel_hz = speed::panel_frames_hz(&self.rig.panel);
         let reached = format!("{reached_hz:.2} frames a second are shown, of the panel's {panel_hz:.1}");
-        let advice = speed::advice(reached_hz, &self.names.engine(), &self.rig, self.names.hologram);
-        match advice.filter(|_| !self.announced.advised) {
+        match self.speed_advice().filter(|_| !self.announced.advised) {
             None => tracing::info!("{reached}"),
             Some(advice) => tracing::warn!("{reached}: {advice}"),
         }
+    }
+
+    /// What would bring more frames a second, where the time that they take is too long.
+    fn speed_advice(&self) -> Option<String> {
+        let frame_time = TimeNs::from_seconds(f64::from(self.tally.frame_time.spread()?.median_ms) / 1e3);
+        let frames_hz = speed::shown_hz(frame_time, &self.rig.panel);
+        speed::advice(frames_hz, &self.names.engine(), &self.rig, self.names.hologram)
     }
 
     pub(super) fn write_status(&mut self, output: &OutputCounts, now: TimeNs) {
@@ -438,24 +448,20 @@ impl Watch<'_> {
     pub(super) fn figures(&self, output: &OutputCounts, now: TimeNs) -> Figures {
         let Self { tally, names, .. } = self;
         let frame_time = tally.frame_time.spread();
-        let engine = names.engine();
-        let speed_advice = frame_time
-            .map(|time| speed::shown_hz(TimeNs::from_seconds(f64::from(time.median_ms) / 1e3), &self.rig.panel))
-            .and_then(|frames_hz| speed::advice(frames_hz, &engine, &self.rig, names.hologram));
         Figures {
             rig: self.rig.name.clone(),
             scene: names.scene.clone(),
             scene_figures: names.scene_figures,
             weights: setup::weights_name(&self.rig.model.weights),
             tracker: names.tracker.clone(),
-            engine,
+            engine: names.engine(),
             hologram: names.hologram.to_string(),
             frames_made: tally.frames_made,
             frames_shown: tally.frames_shown,
             deadline_misses: tally.deadline_misses,
             panel_frames_hz: speed::panel_frames_hz(&self.rig.panel),
             panel_refresh_hz: output.refresh_hz,
-            speed_advice,
+            speed_advice: self.speed_advice(),
             frame_time,
             sample_to_photon: tally.sample_to_photon.spread(),
             picture_to_photon: tally.picture_to_photon.spread(),
