@@ -14,8 +14,8 @@
 //! them.
 //!
 //! Where the device's clock can be read by itself, such readings hold the line down, and samples lie above it by the
-//! delay that all of them have: as long as a camera takes, and a computer for its images. What is far above is judged by
-//! the line of the samples alone, which without readings is the same.
+//! delay that all of them have: as long as a camera takes, and a computer for its images. What is far above is judged
+//! by the line of the samples alone, which without readings is the same.
 
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 

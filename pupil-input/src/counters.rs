@@ -103,8 +103,8 @@ const COUNTERS: usize = Counter::ALL.len();
 const REJECTIONS: usize = Rejection::ALL.len();
 const FAULTS: usize = LOG_FAULT_NAMES.len();
 
-/// The counters themselves; written by the tracker's thread only. All but the gaps only grow: of the missing numbers all
-/// that were skipped.
+/// The counters themselves; written by the tracker's thread only. All but the gaps only grow: the missing numbers are
+/// all that were skipped.
 #[derive(Debug)]
 pub(crate) struct Counters {
     counts: [AtomicU64; COUNTERS],
