@@ -12,6 +12,10 @@
 //! wrong time) or far above (set back, stopped for a while, or one late sample) is a stray. Strays that agree with each
 //! other, or that go on for too long without a fitting sample between them, are a reset, and the line begins anew with
 //! them.
+//!
+//! Where the device's clock can be read by itself, such readings hold the line down, and samples lie above it by the
+//! delay that all of them have: as long as a camera takes, and a computer for its images. What is far above is judged
+//! by the line of the samples alone, which without readings is the same.
 
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 
@@ -28,13 +32,15 @@ const GREATEST_SLOPE: f64 = 0.3;
 
 /// So far below the line a sample is a stray.
 const STRAY_BELOW: TimeNs = TimeNs(50_000_000);
-/// So far above the line a sample is a stray.
+/// So far above the line of the samples a sample is a stray.
 const STRAY_ABOVE: TimeNs = TimeNs(150_000_000);
 /// A sample before its predecessor in the device's time is one that was overtaken, unless it lies by this or more above
 /// the line: then it may be that the clock was set back.
 const STRAY_BACKWARDS: TimeNs = TimeNs(30_000_000);
 /// A clock that falls by this much has restarted or wrapped: no link keeps a sample for so long.
 pub(crate) const RESTART: TimeNs = TimeNs(1_000_000_000);
+/// No delay that all samples have is longer.
+const LONGEST_DELAY: TimeNs = RESTART;
 /// Strays agree when their offsets differ by less.
 const AGREEMENT: TimeNs = TimeNs(50_000_000);
 /// So many strays that agree are a step forward or a restart.
@@ -51,7 +57,10 @@ const OLDEST: TimeNs = TimeNs(60_000_000_000);
 /// Maps device times to host times; constant memory. Device times may be any.
 #[derive(Clone, Debug)]
 pub struct ClockModel {
+    /// Of samples and readings.
     line: Line,
+    /// Of samples alone.
+    samples: Line,
     strays: Option<Strays>,
     /// The latest device time that fitted, and what it was mapped to.
     newest: Option<Mapped>,
@@ -134,7 +143,8 @@ impl Default for ClockModel {
 impl ClockModel {
     /// A model that knows nothing yet: the first sample is taken to have arrived at once.
     pub const fn new() -> Self {
-        Self { line: Line::new(), strays: None, newest: None, spread_ns: 1e6, resets: 0, leaps: 0 }
+        let (line, samples) = (Line::new(), Line::new());
+        Self { line, samples, strays: None, newest: None, spread_ns: 1e6, resets: 0, leaps: 0 }
     }
 
     /// Host time at which a sample of device time `device` was taken, given that it arrived at `arrival`; never later
@@ -147,13 +157,14 @@ impl ClockModel {
             if !self.is_reset(device, offset_ns, arrival) {
                 return self.map_stray(device, offset_ns, arrival);
             }
-            *(if self.line.noted >= ESTABLISHED { &mut self.resets } else { &mut self.leaps }) += 1;
-            self.line = Line::new();
+            *(if self.samples.noted >= ESTABLISHED { &mut self.resets } else { &mut self.leaps }) += 1;
+            (self.line, self.samples) = (Line::new(), Line::new());
             self.newest = None;
         }
         self.strays = None;
         self.line.note(device, offset_ns, arrival);
-        let excess_ns = offset_ns.saturating_sub(self.line.offset_at(device)).max(0) as f64;
+        self.samples.note(device, offset_ns, arrival);
+        let excess_ns = self.samples.above(device, offset_ns).max(0) as f64;
         // A sign-following quantile.
         let step_ns = (self.spread_ns / 20.0).max(10_000.0);
         self.spread_ns += if excess_ns > self.spread_ns { 0.95 * step_ns } else { -0.05 * step_ns };
@@ -175,10 +186,18 @@ impl ClockModel {
     /// do, it lies below theirs by as much, so that they are mapped to when they were taken.
     pub fn observe(&mut self, device: TimeNs, arrival: TimeNs) {
         let offset_ns = arrival.0.saturating_sub(device.0);
-        // One far above is late, or the clock was set back, which the samples will tell.
-        let late = |line: &Line| offset_ns.saturating_sub(line.offset_at(device)) > STRAY_ABOVE.0;
-        if self.line.noted == 0 || !late(&self.line) {
-            self.line.note(device, offset_ns, arrival);
+        // One far above is late, or the clock was set back; one far below is wrong, or the clock was set forward. The
+        // samples will tell.
+        let late = self.line.noted > 0 && self.line.above(device, offset_ns) > STRAY_ABOVE.0;
+        let early = self.samples.noted > 0 && self.samples.above(device, offset_ns) < -LONGEST_DELAY.0;
+        if late || early {
+            return;
+        }
+        self.line.note(device, offset_ns, arrival);
+        // The clock goes on as it did: samples far above their line have a longer delay than those before them.
+        if self.strays.is_some_and(|strays| self.samples.above(device, strays.offset_ns) > 0) {
+            self.strays = None;
+            self.samples = Line::new();
         }
     }
 
@@ -209,10 +228,11 @@ impl ClockModel {
 
     fn is_stray(&self, device: TimeNs, offset_ns: i64) -> bool {
         let Some(newest) = self.newest else { return false };
-        let above_ns = offset_ns.saturating_sub(self.line.offset_at(device));
         let backwards = device < newest.device;
-        let above = if backwards { STRAY_BACKWARDS } else { STRAY_ABOVE };
-        !(-STRAY_BELOW.0..=above.0).contains(&above_ns)
+        let most = if backwards { STRAY_BACKWARDS } else { STRAY_ABOVE };
+        let above_ns = self.line.above(device, offset_ns);
+        !(-STRAY_BELOW.0..=LONGEST_DELAY.0 + most.0).contains(&above_ns)
+            || self.samples.noted > 0 && self.samples.above(device, offset_ns) > most.0
     }
 
     fn is_reset(&mut self, device: TimeNs, offset_ns: i64, arrival: TimeNs) -> bool {
@@ -225,7 +245,7 @@ impl ClockModel {
         }
         strays.offset_ns = offset_ns;
         let Some(newest) = self.newest else { return true };
-        let below = offset_ns < self.line.offset_at(device);
+        let below = self.line.above(device, offset_ns) < 0;
         let fell_ns = newest.device.0.saturating_sub(device.0);
         let lasted = |since: TimeNs| arrival - since;
         let agree = strays.agreeing >= AGREEING;
@@ -238,7 +258,7 @@ impl ClockModel {
     /// predecessor, what lies above it is late.
     fn map_stray(&self, device: TimeNs, offset_ns: i64, arrival: TimeNs) -> TimeNs {
         match self.newest {
-            Some(newest) if offset_ns < self.line.offset_at(device) => {
+            Some(newest) if self.line.above(device, offset_ns) < 0 => {
                 let since = (arrival - newest.arrival).0.max(1);
                 TimeNs(newest.host.0.saturating_add(since)).min(arrival)
             }
@@ -286,6 +306,11 @@ impl Line {
         };
         // After a silence the newest points are old ones.
         self.backwards().take(RECENT).map(at).min().unwrap_or(0)
+    }
+
+    /// By how much `offset_ns` lies above the line at `device`, ns.
+    fn above(&self, device: TimeNs, offset_ns: i64) -> i64 {
+        offset_ns.saturating_sub(self.offset_at(device))
     }
 
     /// The points, the newest first.

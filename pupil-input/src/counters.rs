@@ -21,9 +21,11 @@ pub enum Counter {
     Partials,
     /// Times at which running numbers were skipped, and did not come after others.
     SequenceGaps,
-    /// Running numbers skipped in all.
+    /// Running numbers skipped in all that did not come after others.
     SequenceMissing,
-    /// Samples with the same number and eye as their predecessor.
+    /// Running numbers skipped that came after others.
+    SequenceOvertaken,
+    /// Samples whose number and eye had come before.
     SequenceRepeats,
     /// Times at which the running number fell.
     SequenceRestarts,
@@ -49,7 +51,7 @@ pub enum Counter {
 
 impl Counter {
     /// Every counter, in the order of their indices.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::Bytes,
         Self::Samples,
         Self::Accepted,
@@ -57,6 +59,7 @@ impl Counter {
         Self::Partials,
         Self::SequenceGaps,
         Self::SequenceMissing,
+        Self::SequenceOvertaken,
         Self::SequenceRepeats,
         Self::SequenceRestarts,
         Self::Connects,
@@ -80,6 +83,7 @@ impl Counter {
             Self::Partials => "partials",
             Self::SequenceGaps => "sequence_gaps",
             Self::SequenceMissing => "sequence_missing",
+            Self::SequenceOvertaken => "sequence_overtaken",
             Self::SequenceRepeats => "sequence_repeats",
             Self::SequenceRestarts => "sequence_restarts",
             Self::Connects => "connects",
@@ -99,7 +103,8 @@ const COUNTERS: usize = Counter::ALL.len();
 const REJECTIONS: usize = Rejection::ALL.len();
 const FAULTS: usize = LOG_FAULT_NAMES.len();
 
-/// The counters themselves; written by the tracker's thread only.
+/// The counters themselves; written by the tracker's thread only. All but the gaps only grow: the missing numbers are
+/// all that were skipped.
 #[derive(Debug)]
 pub(crate) struct Counters {
     counts: [AtomicU64; COUNTERS],
@@ -120,9 +125,9 @@ impl Counters {
         self.counts[counter as usize].fetch_add(count, Ordering::Relaxed);
     }
 
-    /// What was counted turned out not to be so.
-    pub(crate) fn take_back(&self, counter: Counter, count: u64) {
-        self.counts[counter as usize].fetch_sub(count, Ordering::Relaxed);
+    /// A gap that was counted turned out to be none.
+    pub(crate) fn fill_gap(&self) {
+        self.counts[Counter::SequenceGaps as usize].fetch_sub(1, Ordering::Relaxed);
     }
 
     pub(crate) fn add_rejected(&self, reason: Rejection) {
@@ -141,8 +146,14 @@ impl Counters {
 
     pub(crate) fn snapshot(&self) -> CounterSnapshot {
         let load = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let mut counts = self.counts.each_ref().map(load);
+        // The thread may have counted between the two: their sum is to be what was skipped, which never falls.
+        let [missing, overtaken] =
+            [Counter::SequenceMissing, Counter::SequenceOvertaken].map(|counter| counter as usize);
+        counts[overtaken] = counts[overtaken].min(counts[missing]);
+        counts[missing] -= counts[overtaken];
         CounterSnapshot {
-            counts: self.counts.each_ref().map(load),
+            counts,
             rejected: self.rejected.each_ref().map(load),
             faults: self.faults.each_ref().map(load),
         }
@@ -249,6 +260,23 @@ mod tests {
         }
         for (index, reason) in Rejection::ALL.into_iter().enumerate() {
             assert_eq!(reason.index(), index);
+        }
+    }
+    #[test]
+    fn numbers_that_are_overtaken_are_taken_from_the_missing_ones() {
+        let counters = Counters::new();
+        let missing_and_overtaken = || {
+            let snapshot = counters.snapshot();
+            [Counter::SequenceMissing, Counter::SequenceOvertaken].map(|counter| snapshot.of(counter))
+        };
+        // The snapshot may see a number overtaken before it sees it skipped.
+        for (counter, count, expected) in [
+            (Counter::SequenceOvertaken, 1, [0, 0]),
+            (Counter::SequenceMissing, 7, [6, 1]),
+            (Counter::SequenceOvertaken, 2, [4, 3]),
+        ] {
+            counters.add(counter, count);
+            assert_eq!(missing_and_overtaken(), expected);
         }
     }
 }

@@ -10,6 +10,8 @@ pub(crate) struct SequenceTracker {
     missing: u128,
     /// The number that came late last, with its eye.
     late: Option<(u64, SampleEye)>,
+    /// The newest of the numbers that came again and rose since the last new one, and how many they are.
+    again: Option<(u64, u32)>,
 }
 
 /// What one running number tells after those before it.
@@ -24,35 +26,42 @@ pub(crate) enum SequenceEvent {
         /// By how much the gaps that there are have grown; a gap is filled, cut short or parted.
         gaps: i8,
     },
-    /// The same number of the same eye again.
+    /// A number that has come before, as of a datagram that a network has doubled.
     Repeat,
     /// The count went backwards: the tracker restarted or its counter wrapped.
     Restart,
 }
 
+/// Of so many numbers before the last one it is known whether they have come.
+const REMEMBERED: u64 = 127;
+/// So many numbers in a row that rise, all of which have come before, are a new count of a tracker that had just begun;
+/// a network doubles fewer at once.
+const RESTART_RISES: u32 = 5;
 /// A longer leap of the running number is a new count, not a loss: an hour at 1 kHz.
 const LONGEST_GAP: u64 = 3_600_000;
 
 impl SequenceTracker {
     /// A tracker that has seen no number.
     pub(crate) const fn new() -> Self {
-        Self { last: None, missing: 0, late: None }
+        Self { last: None, missing: 0, late: None, again: None }
     }
 
     /// Takes the next sample's number.
     pub(crate) fn next(&mut self, sequence: u64, eye: SampleEye) -> SequenceEvent {
-        if let Some((last, _)) = self.last
-            && let Some(back) = last.checked_sub(sequence)
-            && let Some(event) = self.overtaken(sequence, eye, back)
-        {
-            return event;
-        }
-        let Some((last, last_eye)) = self.last.replace((sequence, eye)) else {
+        let Some((last, last_eye)) = self.last else {
+            self.last = Some((sequence, eye));
             return SequenceEvent::InOrder;
         };
+        if let Some(back @ 0..=REMEMBERED) = last.checked_sub(sequence) {
+            if back == 0 && eye != last_eye {
+                self.last = Some((sequence, eye));
+                return SequenceEvent::InOrder;
+            }
+            return self.not_new(sequence, eye, back);
+        }
+        self.last = Some((sequence, eye));
+        self.again = None;
         match sequence.checked_sub(last) {
-            Some(0) if eye == last_eye => SequenceEvent::Repeat,
-            Some(0) => SequenceEvent::InOrder,
             Some(step @ 1..=LONGEST_GAP) => {
                 let passed = u32::try_from(step).ok();
                 let shifted = |bits: u128| passed.and_then(|step| bits.checked_shl(step)).unwrap_or(0);
@@ -68,20 +77,29 @@ impl SequenceTracker {
         }
     }
 
-    /// A number `back` before the last one, if it was missing.
-    fn overtaken(&mut self, sequence: u64, eye: SampleEye, back: u64) -> Option<SequenceEvent> {
+    /// A number `back` before the last one: one that was missing, or one that comes again.
+    fn not_new(&mut self, sequence: u64, eye: SampleEye, back: u64) -> SequenceEvent {
         if self.late.is_some_and(|(number, other)| number == sequence && other != eye) {
-            return Some(SequenceEvent::InOrder);
+            return SequenceEvent::InOrder;
         }
-        let place = u32::try_from(back.checked_sub(1)?).ok()?;
-        let is_missing = |place: u32| self.missing.checked_shr(place).is_some_and(|bits| bits & 1 == 1);
-        if !is_missing(place) {
-            return None;
+        let is_missing = |place: u64| self.missing >> place & 1 == 1;
+        if let Some(place) = back.checked_sub(1).filter(|place| is_missing(*place)) {
+            let beside = i8::from(place > 0 && is_missing(place - 1)) + i8::from(is_missing(place + 1));
+            self.missing &= !(1 << place);
+            self.late = Some((sequence, eye));
+            return SequenceEvent::Overtaken { gaps: beside - 1 };
         }
-        let beside = i8::from(place > 0 && is_missing(place - 1)) + i8::from(is_missing(place + 1));
-        self.missing &= !(1 << place);
-        self.late = Some((sequence, eye));
-        Some(SequenceEvent::Overtaken { gaps: beside - 1 })
+        let rises = match self.again {
+            Some((newest, rises)) if sequence == newest => rises,
+            Some((newest, rises)) if sequence > newest => rises + 1,
+            _ => 1,
+        };
+        if rises < RESTART_RISES {
+            self.again = Some((sequence, rises));
+            return SequenceEvent::Repeat;
+        }
+        *self = Self { last: Some((sequence, eye)), ..Self::new() };
+        SequenceEvent::Restart
     }
 }
 
@@ -93,11 +111,11 @@ mod tests {
     fn sequence_gaps_repeats_and_restarts_are_told_apart() {
         let mut tracker = SequenceTracker::default();
         let mut next = |sequence, eye| tracker.next(sequence, eye);
-        assert_eq!(next(5, SampleEye::Left), SequenceEvent::InOrder);
-        assert_eq!(next(5, SampleEye::Right), SequenceEvent::InOrder);
-        assert_eq!(next(6, SampleEye::Left), SequenceEvent::InOrder);
-        assert_eq!(next(6, SampleEye::Left), SequenceEvent::Repeat);
-        assert_eq!(next(10, SampleEye::Left), SequenceEvent::Gap(3));
+        assert_eq!(next(205, SampleEye::Left), SequenceEvent::InOrder);
+        assert_eq!(next(205, SampleEye::Right), SequenceEvent::InOrder);
+        assert_eq!(next(206, SampleEye::Left), SequenceEvent::InOrder);
+        assert_eq!(next(206, SampleEye::Left), SequenceEvent::Repeat);
+        assert_eq!(next(210, SampleEye::Left), SequenceEvent::Gap(3));
         assert_eq!(next(0, SampleEye::Left), SequenceEvent::Restart);
         // What came before the restart is not missing after it.
         assert_eq!(next(3, SampleEye::Left), SequenceEvent::Gap(2));
@@ -132,6 +150,32 @@ mod tests {
         assert_eq!(counts([1, 3].into_iter().chain(4..132).chain([2])), (1, 1, 1));
         assert_eq!(counts([1, 200, 72]), (1, 198, 1));
         assert_eq!(counts([1, 200, 74]), (2, 197, 0));
-        assert_eq!(counts([1, 2, 3, 2]), (0, 0, 1));
+    }
+
+    #[test]
+    fn numbers_that_come_again_are_neither_restarts_nor_losses() {
+        assert_eq!(counts([1, 2, 3, 2, 4]), (0, 0, 0));
+        assert_eq!(counts((1..=10).chain([8, 11, 12])), (0, 0, 0));
+        // A copy of each some numbers later, of four at once, again and again, and beside a loss.
+        assert_eq!(counts((10..200).flat_map(|number| [number, number - 3])), (0, 0, 0));
+        assert_eq!(counts((10..200).flat_map(|number| [number].into_iter().chain(number - 4..number))), (0, 0, 0));
+        assert_eq!(counts((1..=10).chain([8; 40]).chain([11])), (0, 0, 0));
+        assert_eq!(counts([1, 2, 5, 2, 1, 6]), (1, 2, 0));
+        // As far back as is remembered, and further.
+        assert_eq!(counts((1..=200).chain([200 - REMEMBERED, 201])), (0, 0, 0));
+        assert_eq!(counts((1..=200).chain([199 - REMEMBERED])), (0, 0, 1));
+    }
+
+    #[test]
+    fn a_tracker_that_begins_anew_soon_is_found() {
+        for begins in [0, 1] {
+            for numbers in [8, 20, 128, 129, 1000] {
+                let anew = |ends: u64| counts((1..=numbers).chain(begins..ends));
+                assert_eq!(anew(begins + u64::from(RESTART_RISES)), (0, 0, 1), "{numbers} from {begins}");
+                assert_eq!(anew(3 * numbers), (0, 0, 1), "{numbers} from {begins}");
+            }
+        }
+        // What was missing before is not afterwards, and losses after it count.
+        assert_eq!(counts((10..=20).chain([25]).chain(0..8).chain([9, 10])), (2, 5, 1));
     }
 }

@@ -182,6 +182,15 @@ fn of_tracker(told: &mut Teller<'_>, counts: &BTreeMap<String, u64>) -> fmt::Res
             }
             ("samples", _) => told.counter("tracker_samples", "Samples of the tracker", count)?,
             ("accepted", _) => told.counter("tracker_accepted_samples", "Samples that were believed", count)?,
+            // It falls where a gap is filled.
+            ("sequence_gaps", _) => {
+                let help = "Gaps in the running numbers that have not been filled";
+                told.gauge("tracker_sequence_gaps", help, None, count as f64)?;
+            }
+            ("sequence_missing", _) => {
+                let overtaken = counts.get("sequence_overtaken").copied().unwrap_or(0);
+                events.push(("sequence_skipped", count + overtaken));
+            }
             (_, Some(reason)) => rejected.push((reason, count)),
             (fault, None) if fault.starts_with("wire_") || fault.starts_with("log_") => faulty.push((fault, count)),
             (event, None) => events.push((event, count)),
@@ -256,6 +265,32 @@ mod tests {
     use super::super::live::Refused;
     use super::*;
     use crate::source::feed::{ClippedPixels, FeedStatus};
+
+    #[test]
+    fn counters_do_not_fall_where_a_late_sample_fills_a_gap() {
+        let told = |missing: u64, overtaken: u64, gaps: u64| {
+            let live = Arc::new(Live::default());
+            let counts = [("sequence_missing", missing), ("sequence_overtaken", overtaken), ("sequence_gaps", gaps)];
+            let mut snapshot = Snapshot::default();
+            snapshot.figures.tracker_counts = counts.map(|(name, count)| (name.to_owned(), count)).into();
+            live.publish(&snapshot, host_now());
+            text(&registry(&live))
+        };
+        let before = told(3, 0, 2);
+        let after = told(2, 1, 1);
+        for line in ["# TYPE holod_tracker_sequence_gaps gauge", "holod_tracker_sequence_gaps 2.0"] {
+            assert!(before.contains(line), "{line} is not in:\n{before}");
+        }
+        let counters = |told: &str| -> BTreeMap<String, f64> {
+            let samples = told.lines().filter_map(|line| line.rsplit_once(' '));
+            let counters = samples.filter(|(name, _)| name.starts_with("holod_tracker_events_total"));
+            counters.map(|(name, count)| (name.to_owned(), count.parse().expect("a figure"))).collect()
+        };
+        let (before, after) = (counters(&before), counters(&after));
+        assert_eq!(before["holod_tracker_events_total{event=\"sequence_skipped\"}"], 3.0);
+        assert_eq!(after["holod_tracker_events_total{event=\"sequence_overtaken\"}"], 1.0);
+        assert!(before.iter().all(|(name, count)| after[name] >= *count), "{before:?} {after:?}");
+    }
 
     #[test]
     fn rejections_and_refusals_are_told_by_their_reasons() {

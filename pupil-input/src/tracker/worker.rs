@@ -478,10 +478,10 @@ impl Worker {
                 self.count(Counter::SequenceMissing, missing);
             }
             SequenceEvent::Overtaken { gaps } => {
-                self.shared.counters.take_back(Counter::SequenceMissing, 1);
+                self.count(Counter::SequenceOvertaken, 1);
                 match gaps {
                     1 => self.count(Counter::SequenceGaps, 1),
-                    -1 => self.shared.counters.take_back(Counter::SequenceGaps, 1),
+                    -1 => self.shared.counters.fill_gap(),
                     _ => {}
                 }
             }

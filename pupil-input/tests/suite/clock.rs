@@ -371,6 +371,78 @@ fn readings_of_the_clock_tell_a_delay_that_all_samples_have() {
     assert!(errors_ms(false).iter().all(|error_ms| *error_ms >= 38));
 }
 
+/// Samples of a camera at 120 Hz, each `delay_ms` of its image's time and up to 5 ms more after it, and how far from
+/// the truth they are mapped, with the clock read four times a second; `device` as in [`send`].
+struct Camera {
+    sent: Vec<Sent>,
+    errors: Vec<i64>,
+    in_order: bool,
+    model: ClockModel,
+}
+
+impl Camera {
+    fn new(delay_ms: impl Fn(i64) -> i64, device: impl Fn(i64) -> i64) -> Self {
+        let mut sent = send(120, 40, Link::Uniform(0, 5 * MS), 14, &device);
+        sent.iter_mut().for_each(|sample| sample.arrival += delay_ms(sample.taken - BEGINS) * MS);
+        sent.sort_by_key(|sample| sample.arrival);
+        let mut readings = (1..200).map(|k| k * 250 * MS).peekable();
+        let mut model = ClockModel::new();
+        let (mut errors, mut in_order, mut newest) = (Vec::new(), true, TimeNs(i64::MIN));
+        for sample in &sent {
+            while let Some(since) = readings.next_if(|since| BEGINS + since + MS <= sample.arrival) {
+                model.observe(TimeNs(device(since)), TimeNs(BEGINS + since + MS));
+            }
+            let mapped = model.map(TimeNs(sample.device), TimeNs(sample.arrival));
+            assert!(mapped.0 <= sample.arrival, "the future");
+            in_order &= mapped > newest;
+            newest = mapped;
+            errors.push(mapped.0 - sample.taken);
+        }
+        Self { sent, errors, in_order, model }
+    }
+
+    /// The greatest error from `after_s` on, ms.
+    fn worst_ms(&self, after_s: i64) -> i64 {
+        let later = self.sent.iter().zip(&self.errors).filter(|(sample, _)| sample.taken - BEGINS >= after_s * S);
+        later.map(|(_, error)| error.abs()).max().expect("some") / MS
+    }
+}
+
+#[test]
+fn readings_tell_a_delay_that_is_longer_than_a_stray_may_lie_above_the_line() {
+    for delay_ms in [0, 40, 140, 155, 200, 300, 900] {
+        let camera = Camera::new(|_| delay_ms, drifting(50));
+        assert_eq!((camera.model.resets(), camera.model.leaps()), (0, 0), "{delay_ms} ms");
+        assert!(camera.in_order && camera.worst_ms(2) <= 3, "{delay_ms} ms: {} ms", camera.worst_ms(2));
+        let spread = camera.model.report().expect("has samples").delay_spread;
+        assert!((3 * MS..6 * MS).contains(&spread.0), "{delay_ms} ms: {spread:?}");
+    }
+    // Longer than any delay is believed to be: the readings are left alone.
+    let camera = Camera::new(|_| 1500, drifting(50));
+    assert_eq!(camera.model.resets(), 0);
+    assert!(camera.in_order && (1499..=1506).contains(&camera.worst_ms(2)), "{} ms", camera.worst_ms(2));
+}
+
+#[test]
+fn a_delay_that_changes_is_no_reset_where_readings_tell_that_the_clock_goes_on() {
+    for (before_ms, after_ms) in [(40, 300), (300, 40), (100, 700), (700, 100), (10, 160)] {
+        let camera = Camera::new(|since| if since < 10 * S { before_ms } else { after_ms }, drifting(50));
+        assert_eq!(camera.model.resets(), 0, "{before_ms} to {after_ms} ms");
+        assert!(camera.worst_ms(2) <= 5, "{before_ms} to {after_ms} ms: {} ms", camera.worst_ms(2));
+    }
+}
+
+#[test]
+fn a_clock_that_is_set_is_found_beside_its_readings() {
+    for by in [-5000 * S, -2 * S, -900 * MS, -400 * MS, 2 * S, 90 * S] {
+        for delay_ms in [5, 200] {
+            let camera = Camera::new(|_| delay_ms, |since| if since < 10 * S { since } else { since + by });
+            assert_eq!(camera.model.resets(), 1, "{by} with {delay_ms} ms");
+            assert!(camera.worst_ms(12) <= 3, "{by} with {delay_ms} ms: {} ms", camera.worst_ms(12));
+        }
+    }
+}
+
 #[test]
 fn wrong_readings_do_no_lasting_harm() {
     let mut model = ClockModel::new();

@@ -63,6 +63,20 @@ impl FieldEvent {
     }
 }
 
+/// A time in which the box was not armed, and why.
+#[derive(Clone, Copy, Debug)]
+struct Darkness {
+    t_dark: TimeNs,
+    t_armed: Option<TimeNs>,
+    reason: DarkReason,
+}
+
+impl Darkness {
+    fn touches(&self, window: &LitWindow) -> bool {
+        self.t_dark < window.t_off && self.t_armed.is_none_or(|t_armed| t_armed > window.t_on)
+    }
+}
+
 /// Puts fields and laser edges together.
 pub(super) struct Ledger {
     gate: FieldGate,
@@ -70,7 +84,7 @@ pub(super) struct Ledger {
     gates_fields: bool,
     open: VecDeque<(ShownField, Option<DarkReason>)>,
     edges: VecDeque<LaserEdge>,
-    last_dark: Option<DarkReason>,
+    darknesses: VecDeque<Darkness>,
     events: Producer<FieldEvent>,
     box_events: Producer<BoxEvent>,
 }
@@ -84,7 +98,8 @@ impl Ledger {
     ) -> Self {
         let open = VecDeque::with_capacity(OPEN_MAX);
         let edges = VecDeque::with_capacity(OPEN_MAX);
-        Self { gate, gates_fields, open, edges, last_dark: None, events, box_events }
+        let darknesses = VecDeque::with_capacity(OPEN_MAX);
+        Self { gate, gates_fields, open, edges, darknesses, events, box_events }
     }
 
     pub(super) fn field(&mut self, field: &ShownField, dark: Option<DarkReason>, shared: &Shared) {
@@ -110,8 +125,17 @@ impl Ledger {
                 }
                 self.edges.push_back(edge);
             }
-            BoxEvent::Dark { reason, .. } => self.last_dark = Some(reason),
-            BoxEvent::Armed { .. } => {}
+            BoxEvent::Dark { t, reason } => {
+                if self.darknesses.len() == OPEN_MAX {
+                    self.darknesses.pop_front();
+                }
+                self.darknesses.push_back(Darkness { t_dark: t, t_armed: None, reason });
+            }
+            BoxEvent::Armed { t } => {
+                if let Some(last) = self.darknesses.back_mut() {
+                    last.t_armed.get_or_insert(t);
+                }
+            }
         }
         if self.box_events.push(event).is_err() {
             count(&shared.lost);
@@ -174,10 +198,15 @@ impl Ledger {
             dark: match (on, dark) {
                 (Some(_), reason) => reason.filter(|reason| reason.forbids_light()),
                 (None, reason) if !self.gates_fields => reason,
-                (None, reason) => reason.or(self.last_dark).or(Some(DarkReason::Late)),
+                (None, reason) => reason.or_else(|| self.why_box_was_dark(field)).or(Some(DarkReason::Late)),
             },
             repeated: field.repeated,
             deadline_missed: !field.repeated && late_ns > timing.frame_period.0 / 2,
         }
+    }
+    /// Why the box could not light the whole window of `field`, where it could not.
+    fn why_box_was_dark(&self, field: &ShownField) -> Option<DarkReason> {
+        let window = self.gate.window(field);
+        self.darknesses.iter().rev().find(|darkness| darkness.touches(&window)).map(|darkness| darkness.reason)
     }
 }

@@ -266,6 +266,45 @@ fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
     }
 }
 
+/// The reasons of the dark fields that came on the panel from `from` to `to`, by their number.
+fn dark_fields(bench: &Bench, from: TimeNs, to: TimeNs) -> Vec<(DarkReason, usize)> {
+    let within = bench.all_events.iter().filter(|event| (from..to).contains(&event.t_present));
+    let reasons: Vec<_> = within.filter(|event| event.laser_on.is_none()).filter_map(|event| event.dark).collect();
+    let count = |reason| reasons.iter().filter(|found| **found == reason).count();
+    DarkReason::ALL.map(|reason| (reason, count(reason))).into_iter().filter(|(_, count)| *count > 0).collect()
+}
+
+#[test]
+fn a_darkness_that_is_over_is_no_reason_for_later_dark_fields() {
+    for is_asked in [false, true] {
+        let mut bench = Bench::new(PanelMode::ChannelPacked);
+        bench.run(TimeNs(300 * MS), TimeNs(0));
+        if is_asked {
+            // Between a field's beginning and its light, so that only the box knows why it was not lit.
+            let t_asked = bench.t_field + TimeNs(MS);
+            bench.run(t_asked, TimeNs(0));
+            bench.laser.shared.dark_request.store(dark_because(NEXT, Some(DarkReason::Asked)), Ordering::Release);
+            bench.wake(t_asked);
+            bench.run(TimeNs(600 * MS), TimeNs(0));
+            let dark = dark_fields(&bench, t_asked - TimeNs(MS), TimeNs(590 * MS));
+            assert!(matches!(dark[..], [(DarkReason::Asked, count)] if count > 45), "{dark:?}");
+            bench.laser.shared.dark_request.store(dark_because(2 * NEXT, None), Ordering::Release);
+        }
+        // The box hears of each colour frame when its first field has gone by.
+        let frame_period = bench.laser.scheduler.gate().timing().frame_period;
+        let t_late = T_FIRST + TimeNs(42 * frame_period.0);
+        bench.run(t_late, TimeNs(0));
+        for _ in 0..20 {
+            bench.now = bench.t_field - TimeNs(MS);
+            bench.submit();
+            bench.wake(bench.t_field + TimeNs(8 * MS));
+            bench.t_field = bench.t_field + frame_period;
+        }
+        let dark = dark_fields(&bench, t_late, bench.t_field - frame_period);
+        assert!(matches!(dark[..], [(DarkReason::Late, count)] if count > 10), "asked before: {is_asked}: {dark:?}");
+    }
+}
+
 #[test]
 fn lasers_are_dark_while_nobody_is_at_the_control_who_was() {
     for (mode, asked) in MODES.into_iter().zip([None, Some(DarkReason::Asked)]) {
