@@ -109,8 +109,8 @@ impl Sight {
         if !spots.is_empty() {
             if !matches!(pattern, Pattern::Level { .. }) {
                 notes.push(
-                    "the light is that of the levels which the panel is sent, on pixels without gaps (a fill factor of 1); the \
-                     rest of it goes to orders that are not listed"
+                    "the light is that of the levels which the panel is sent, on pixels without gaps (a fill factor of \
+                     1); the rest of it goes to orders that are not listed"
                         .into(),
                 );
             }
