@@ -1,6 +1,6 @@
 //! The display seen as a thin lens: how depths, blurs and angles map to the panel.
 
-use crate::{Colour, Dioptres, Metres, PerColour, PupilDiameter, Resolution};
+use crate::{Dioptres, Metres, PerColour, PupilDiameter, Resolution};
 
 /// The optical numbers of a display on which a hologram depends.
 ///
@@ -84,17 +84,6 @@ impl DisplayGeometry {
     /// the wavelength. Its root is how far light spreads by diffraction from one end of the range to the other.
     pub fn volume_fresnel_px2(&self) -> PerColour<f64> {
         self.wavelengths.map(|wavelength| wavelength.0 * self.volume().0 / self.pixel_angle_rad().powi(2))
-    }
-
-    /// The colour of the longest wavelength. The stop of the 4f relay, one for all colours, is set for it: set for
-    /// another one it would cut into the half band of this one.
-    pub fn longest(&self) -> Colour {
-        let [red, green, blue] = self.wavelengths.0.map(|wavelength| wavelength.0);
-        match () {
-            () if red >= green && red >= blue => Colour::Red,
-            () if green >= blue => Colour::Green,
-            () => Colour::Blue,
-        }
     }
 
     /// Width of the eyebox λf/p of each colour: the separation of the panel's diffraction orders at the eye.

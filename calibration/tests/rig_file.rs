@@ -1424,6 +1424,23 @@ fn colours_that_are_never_seen_have_no_light() {
 }
 
 #[test]
+fn the_stop_is_set_for_the_longest_wavelength_of_lasers_with_power() {
+    let mut rig = Rig::default();
+    // A full-colour bench in alignment keeps its stop.
+    rig.panel.mode = PanelMode::Monochrome(Colour::Green);
+    assert_eq!(rig.stop_colour(), Colour::Red);
+    for (power_mw, expected) in [
+        ([0.0, 1.0, 0.0], Colour::Green),
+        ([0.0, 1.0, 2.0], Colour::Green),
+        ([0.0, 0.0, 2.0], Colour::Blue),
+        ([0.0; 3], Colour::Red),
+    ] {
+        rig.lasers.power_mw = PerColour(power_mw);
+        assert_eq!(rig.stop_colour(), expected, "{power_mw:?}");
+    }
+}
+
+#[test]
 fn meaning_says_the_lasers_powers_and_what_bounds_them() {
     let meaning = |lines: &str| with_driver(lines).unwrap().meaning();
     let unlimited = "no power_limit_mw, so that a power_mw of up to 500 is taken";
@@ -1457,6 +1474,10 @@ fn meaning_says_the_lasers_powers_and_what_bounds_them() {
     let one =
         meaning(&format!("driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ green = \"/dev/g\" }}\n{ACCEPTED}"));
     assert!(is_noted(&one, "green"), "{:?}", one.notes);
+    // Nor is the stop set for one: λ·F/2p of 520 nm, 8 µm and 100 mm.
+    let is_set_for = |meaning: &Meaning, text: &str| meaning.notes.iter().any(|note| note.contains(text));
+    assert!(is_set_for(&one, "set it for green, λ·F/2p = 3.25 mm"), "{:?}", one.notes);
+    assert!(is_set_for(&limited, "set it for red, λ·F/2p = 3.99 mm"), "{:?}", limited.notes);
     assert!(one.to_string().contains("lasers         text /dev/g; without a heartbeat: lit when holod dies\n"));
     assert!(!Rig::default().meaning().notes.iter().any(|note| note.contains(unlimited)));
     let beam = meaning(&format!(

@@ -47,10 +47,15 @@ pub fn rig_with_network(args: &RigArgs, network: &NetworkArgs) -> Result<Rig, Fa
 /// The same for what is shown on its panel, with a warning of what that cannot show.
 pub fn rig_to_show(args: &RigArgs, network: &NetworkArgs) -> Result<Rig, Failure> {
     let rig = rig_with_network(args, network)?;
+    warn_of_panel(&rig);
+    Ok(rig)
+}
+
+/// Warns of what the rig's panel cannot show.
+pub fn warn_of_panel(rig: &Rig) {
     for warning in rig.panel.warnings() {
         tracing::warn!("{warning}");
     }
-    Ok(rig)
 }
 
 /// The rig's weights, for whatever bench they were trained.
@@ -67,16 +72,23 @@ pub fn load_weights(rig: &Rig) -> Result<Weights, Failure> {
     }
 }
 
-/// The rig's weights, which must have been trained for benches such as this; what they know less well is warned of.
+/// The rig's weights, which must have been trained for benches such as this; what they know less well is warned of, and
+/// pupils of most eyes that they do not know.
 pub fn weights(rig: &Rig) -> Result<Weights, Failure> {
+    let weights = weights_for_one_pupil(rig)?;
+    if let Some(few) = few_pupils(&weights, &rig.geometry) {
+        tracing::warn!("{few}");
+    }
+    Ok(weights)
+}
+
+/// The same for one pupil that is named: [`check_pupil`] refuses those outside the range.
+pub fn weights_for_one_pupil(rig: &Rig) -> Result<Weights, Failure> {
     let weights = load_weights(rig)?;
     match weights.fit(&rig.geometry) {
         BenchFit::Inside => {}
         BenchFit::Near(outside) => tracing::warn!("{outside}"),
         BenchFit::Far(outside) => return Err(Failure::because(Exit::Config)(outside)),
-    }
-    if let Some(few) = few_pupils(&weights, &rig.geometry) {
-        tracing::warn!("{few}");
     }
     Ok(weights)
 }

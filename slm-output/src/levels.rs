@@ -327,6 +327,14 @@ impl PanelEncoder {
         self.of_pattern(&shown)
     }
 
+    /// The phase in radians, with its whole turns, that a flat panel shows for each of `phases_rad`, which are wrapped.
+    pub fn shown_when_flat(&self, colour: Colour, phases_rad: &[f32]) -> Vec<f32> {
+        let encoder = &self.colours[colour.index()];
+        let mut levels = vec![0; phases_rad.len()];
+        encoder.encode_strided::<1>(phases_rad, None, &mut levels);
+        levels.into_iter().map(|level| encoder.phase_of_level_rad[usize::from(level)]).collect()
+    }
+
     /// The part of a panel's values that carries the pattern.
     fn of_pattern(&self, values: &[f32]) -> Vec<f32> {
         let ((left, top), [mirrors_x, mirrors_y]) = (self.pattern_origin(), self.mirrors);

@@ -58,6 +58,46 @@ fn a_picture_holds_the_bytes_that_travel_to_the_panel() {
 }
 
 #[test]
+fn a_picture_has_what_the_video_has_around_the_panel() {
+    let folder = holod_tests::new_folder();
+    let wide = rig().replace("phase_sign", "video_width_px = 104\nvideo_left_px = 3\nvideo_height_px = 66\nphase_sign");
+    let ended = pattern(folder.path(), &wide, "level 37 --out level.png");
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let level = picture(&folder.path().join("level.png"));
+    assert_eq!(level.dimensions(), (104, 66));
+    for (x, y, pixel) in level.enumerate_pixels() {
+        let is_panel = (3..99).contains(&x) && y < 64;
+        assert_eq!(pixel.0, [if is_panel { 37 } else { 0 }; 3], "{x},{y}");
+    }
+}
+
+#[test]
+fn a_short_stroke_is_warned_of_and_counts_in_the_shares() {
+    let folder = holod_tests::new_folder();
+    let first = |rig: &str| {
+        let ended = pattern(folder.path(), rig, "grating --period 8 --colour red --json");
+        assert!(ended.status.success(), "{}", ended.stderr);
+        assert_eq!(ended.stderr.contains("stroke"), rig.contains("1.4,"), "{}", ended.stderr);
+        let said: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+        said["spots"][0]["share"].as_f64().unwrap()
+    };
+    let whole = first(&rig());
+    let short = first(&rig().replace("1.9921875", "1.4"));
+    // sinc²(1/8), of which the gap of 0.6 π leaves 0.924.
+    assert!((whole - 0.9496).abs() < 1e-3 && (short - 0.924 * 0.9496).abs() < 4e-3, "{whole} {short}");
+}
+
+#[test]
+fn a_colour_that_the_panel_never_shows_is_refused() {
+    let folder = holod_tests::new_folder();
+    let monochrome = rig().replace("\"channel-packed\"", "\"monochrome\"\ncolour = \"green\"");
+    let ended = pattern(folder.path(), &monochrome, "level 200 --colour red --out x.png");
+    assert_eq!(ended.status.code(), Some(64), "{}", ended.stderr);
+    assert!(ended.stderr.contains("the panel shows green alone"), "{}", ended.stderr);
+    assert!(!folder.path().join("x.png").exists());
+}
+
+#[test]
 fn a_pattern_on_a_panel_is_lit_by_each_fields_own_laser_or_stays_dark() {
     let folder = holod_tests::new_folder();
     let lit = pattern(folder.path(), &rig(), "field-identity --output headless --duration 1500ms");

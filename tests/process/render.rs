@@ -189,3 +189,19 @@ fn colours_that_a_monochrome_panel_never_shows_are_black() {
     let brightest = seen.pixels().fold([0; 3], |most, pixel| std::array::from_fn(|c| pixel.0[c].max(most[c])));
     assert!(brightest[0] == 0 && brightest[1] > 100 && brightest[2] == 0, "{brightest:?}");
 }
+
+#[test]
+fn a_pupil_that_is_refused_is_not_said_to_be_shown_worse() {
+    let folder = holod_tests::new_folder();
+    // On this bench the weights know pupils of up to 3.76 mm.
+    let bench = concat!(env!("CARGO_MANIFEST_DIR"), "/../model/training/benches/gaea-40.toml");
+    let shared = ["--config", bench, "--weights", "fast", "--backend", "cpu", "--resolution", "48x48"];
+    let named = run(HOLOD, &[&["render", "--pupil", "4", "--out", "out"], &shared[..]].concat(), folder.path());
+    assert_eq!(named.status.code(), Some(64), "{named:?}");
+    assert!(named.stderr.contains("--pupil: found 4 mm"), "{}", named.stderr);
+    let any = ["run", "--tracker", "mock:steady", "--output", "headless", "--frames", "2"];
+    let any = run(HOLOD, &[&any[..], &shared].concat(), folder.path());
+    assert!(any.status.success(), "{any:?}");
+    let worse = |stderr: &str| stderr.contains("the picture is worse");
+    assert!(!worse(&named.stderr) && worse(&any.stderr), "{} {}", named.stderr, any.stderr);
+}

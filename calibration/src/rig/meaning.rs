@@ -512,7 +512,7 @@ fn notes(rig: &Rig) -> Vec<String> {
             rig.geometry.eyepiece_focal_length.0 * 1e3
         ));
     }
-    let longest = rig.geometry.longest();
+    let longest = rig.stop_colour();
     notes.push(format!(
         "the stop of the 4f relay is one for all colours: set it for {longest}, λ·F/2p = {:.2} mm wide for each \
          100 mm of the focal length F before it",

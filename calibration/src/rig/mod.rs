@@ -495,6 +495,19 @@ impl Rig {
         }))
     }
 
+    /// The colour for which the stop of the 4f relay, one for all colours, is set: the longest wavelength of the lasers
+    /// that are there and have power, whatever the panel's mode shows of them now; set for another one it would cut
+    /// into the half band of this one. Of all wavelengths where there is no such laser.
+    pub fn stop_colour(&self) -> Colour {
+        let is_lit = |colour: &Colour| self.lasers.driver.has(*colour) && self.lasers.power_mw[*colour] > 0.0;
+        let is_longer = |one: &Colour, other: &Colour| {
+            let [one, other] = [one, other].map(|colour| self.geometry.wavelengths[*colour].0);
+            one.total_cmp(&other)
+        };
+        let longest_lit = Colour::ALL.into_iter().filter(is_lit).max_by(is_longer);
+        longest_lit.or(Colour::ALL.into_iter().max_by(is_longer)).unwrap_or(Colour::Red)
+    }
+
     /// Panel pixels.
     pub fn resolution(&self) -> Resolution {
         self.geometry.resolution

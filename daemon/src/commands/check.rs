@@ -132,12 +132,13 @@ fn weights_checks(rig: &Rig, weights: &Result<Weights, Failure>) -> Vec<Check> {
 /// one, and so is a GPU that computes wrongly.
 fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, Option<Resolution>)) -> Vec<Check> {
     let panel = rig.resolution();
-    let sizes = match resolution {
-        Some(size) => vec![size],
-        None => vec![scene::SAMPLE_RESOLUTION, panel],
-    };
     let fits = |size: &Resolution| size.width <= panel.width && size.height <= panel.height;
-    let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();
+    let mut sizes = match resolution {
+        Some(size) => vec![size],
+        None => vec![scene::sample_resolution_on(panel), panel],
+    };
+    sizes.retain(fits);
+    sizes.dedup();
     let estimate = |weights| progress::during("estimating the frames a second", || Estimate::of(rig, weights, backend));
     let estimated = weights.map(estimate);
     let compared: Vec<Check> = match (&estimated, weights) {

@@ -190,6 +190,7 @@ fn summary_text(session: &SessionReport, views: &[EyeView]) -> String {
     if views.iter().any(|view| view.near_energy.is_none() || view.far_energy.is_none()) {
         table.push_str("  (none: at this resolution the card is too small to be judged)\n");
     }
+    let phase_mm = views.last().map_or(0.0, |view| view.pupil.mm());
     format!(
         "holod demo\n\n\
          A simulated eye whose pupil closes to about 2 mm in bright light and opens to about 6 mm in the dark was\n\
@@ -197,7 +198,7 @@ fn summary_text(session: &SessionReport, views: &[EyeView]) -> String {
          arrives, double-phase encoded, turned into panel levels and shown on a virtual panel at 60 Hz, colour after\n\
          colour, each laser lit only over its own field.\n\n\
          eye.png                     what the eye sees of the levels that the panel really showed\n\
-         phase_<colour>.png          the phase pattern of the widest pupil; black is 0, white 2 pi\n\
+         phase_<colour>.png          the phase pattern of the widest pupil kept, {phase_mm:.2} mm: black 0, white 2 pi\n\
          pupil.svg                   raw samples, what the gate rejected, the estimate, and the simulated eye's truth\n\
          latency.svg                 what each frame cost\n\
          frames.csv, summary.json    the record of every colour field, and the numbers of the run\n\n\

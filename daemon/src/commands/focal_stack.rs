@@ -56,7 +56,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
         return Err(Failure::new(Exit::Usage, only));
     }
     let staging = Staging::new(&args.out, &FILES, args.force)?;
-    let weights = progress::during("loading the network", || setup::weights(rig))?;
+    let weights = progress::during("loading the network", || setup::weights_for_one_pupil(rig))?;
     let name = directory.display().to_string();
     let at_fault = |error: EngineError| match error {
         EngineError::Focuses { .. } => Failure::new(Exit::Data, format!("{name}/stack.toml: {error}")),

@@ -125,7 +125,7 @@ pub(super) fn compute(
     pupil: PupilDiameter,
     backend: Backend,
 ) -> Result<Computed, Failure> {
-    let weights = progress::during("loading the network", || setup::weights(rig))?;
+    let weights = progress::during("loading the network", || setup::weights_for_one_pupil(rig))?;
     setup::check_pupil(&weights, &rig.geometry, pupil)
         .map_err(|why| Failure::new(Exit::Usage, format!("--pupil: {why}")))?;
     let frames = progress::during("loading the scene", || scene::first_frame(named, &rig.geometry))?;

@@ -277,12 +277,18 @@ fn odd_depth(source: Resolution, report: &FrameReport, geometry: &DisplayGeometr
         .then(|| format!("all depths lie within {spread_dpt:.3} dpt: is the depth encoding right?"))
 }
 
+/// Size of the built-in scene on `panel` where none is asked for.
+pub fn sample_resolution_on(panel: Resolution) -> Resolution {
+    let Resolution { width, height } = SAMPLE_RESOLUTION;
+    Resolution { width: width.min(panel.width), height: height.min(panel.height) }
+}
+
 /// Size of the built-in scene.
 fn sample_resolution(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Resolution, Failure> {
     if args.depth_encoding.is_some() {
         return Err(Failure::new(Exit::Usage, "--depth-encoding says how to read a depth file: name one with --scene"));
     }
-    let resolution = args.resolution.unwrap_or(SAMPLE_RESOLUTION);
+    let resolution = args.resolution.unwrap_or_else(|| sample_resolution_on(geometry.resolution));
     check_fits(resolution, geometry, "--resolution")?;
     Ok(resolution)
 }
@@ -360,6 +366,22 @@ mod tests {
             .map(|(size, fit)| scene.load(0, &BENCH, Some(size), fit).unwrap().1)
             .map(|report| odd_depth(report.source.unwrap(), &report, &BENCH, false))
             .collect()
+    }
+
+    #[test]
+    fn the_built_in_scene_fits_on_every_panel_unless_a_size_is_asked_for() {
+        let size = |width, height| Resolution { width, height };
+        let on = |panel, resolution| {
+            let geometry = DisplayGeometry { resolution: panel, ..DisplayGeometry::DEFAULT };
+            sample_resolution(&SceneArgs { resolution, ..SceneArgs::default() }, &geometry)
+        };
+        for (panel, expected) in
+            [(size(300, 280), size(300, 280)), (size(1920, 480), size(512, 480)), (size(1920, 1080), SAMPLE_RESOLUTION)]
+        {
+            assert_eq!(on(panel, None).unwrap(), expected);
+        }
+        let refused = on(size(300, 280), Some(SAMPLE_RESOLUTION)).unwrap_err();
+        assert!(refused.to_string().starts_with("--resolution: found 512x512, larger than the panel of 300x280"));
     }
 
     #[test]

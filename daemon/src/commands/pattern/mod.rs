@@ -22,6 +22,7 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
     let output =
         to.output.as_deref().map(str::parse::<OutputSpec>).transpose().map_err(Failure::because(Exit::Usage))?;
     let rig = setup::rig(&to.rig)?;
+    setup::warn_of_panel(&rig);
     let resolution = rig.resolution();
     let encoder = PanelEncoder::new(&rig.panel, resolution, resolution).map_err(Failure::because(Exit::Config))?;
     let pattern = Pattern::from(kind);
@@ -29,7 +30,7 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
     let mut levels = LevelsFrame::new(FrameLayout::new(&rig.panel, resolution));
     let usage = Failure::because(Exit::Usage);
     pattern.draw(&placement, &encoder, &rig.geometry, &mut levels).map_err(&usage)?;
-    let mut sight = Sight::of(&pattern, &placement, &rig).map_err(usage)?;
+    let mut sight = Sight::of(&pattern, &placement, &rig, &encoder).map_err(usage)?;
     if let Some(out) = &to.out {
         sight.files = save(&levels, out, to.force)?;
     }

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 use holod_calibration::rig::{PanelMode, Rig};
 use holod_calibration::{Colour, Metres};
+use holod_slm_output::PanelEncoder;
 use holod_slm_output::patterns::{Order, Pattern, PatternError, Placement, stop_frequency};
 use serde::Serialize;
 
@@ -44,7 +45,13 @@ struct Spot {
 }
 
 impl Sight {
-    pub(super) fn of(pattern: &Pattern, placement: &Placement, rig: &Rig) -> Result<Self, PatternError> {
+    /// What is seen on `rig`, for whose panel `encoder` was made.
+    pub(super) fn of(
+        pattern: &Pattern,
+        placement: &Placement,
+        rig: &Rig,
+        encoder: &PanelEncoder,
+    ) -> Result<Self, PatternError> {
         let optics = &rig.geometry;
         let shown = |colour: Colour| {
             placement.colours[colour] && !matches!(rig.panel.mode, PanelMode::Monochrome(only) if only != colour)
@@ -52,7 +59,7 @@ impl Sight {
         let fields: Vec<Colour> = Colour::ALL.into_iter().filter(|&colour| shown(colour)).collect();
         let mut spots = Vec::new();
         for &field in &fields {
-            let orders = pattern.orders(optics, field, field)?;
+            let orders = pattern.orders(rig, encoder, field, field)?;
             let seen = orders.iter().filter(|order| order.share >= SHARE_MIN || order.number == [0, 0]);
             spots.extend(seen.map(|order| Spot::of(field, order)));
         }
@@ -67,20 +74,7 @@ impl Sight {
             Pattern::Grating { .. } => notes.push("light on the opposite side means that panel.phase_sign or panel.orientation is wrong".into()),
             Pattern::Lens { focal_length: Metres(f_m), .. } => {
                 for &field in &fields {
-                    let diameter_m = pattern.lens_diameter(optics, field)?.0;
-                    let wave_m2 = optics.wavelengths[field].0 * f_m.abs();
-                    // What it passes are slopes of the phase, in x and in y.
-                    let passed_m = 2.0 * wave_m2 * stop_frequency(optics, field);
-                    let (aperture, spot_m) = if diameter_m <= passed_m {
-                        (String::new(), 1.22 * wave_m2 / diameter_m)
-                    } else {
-                        (format!(", of which the stop passes a square of {:.3} mm", 1e3 * passed_m), wave_m2 / passed_m)
-                    };
-                    notes.push(format!(
-                        "{field}: a lens of {:.3} mm{aperture}; its focus has a radius of {:.1} µm",
-                        1e3 * diameter_m,
-                        1e6 * spot_m
-                    ));
+                    notes.push(lens_note(pattern, f_m, placement.axis_px, rig, field)?);
                 }
                 let eyepiece_m = optics.eyepiece_focal_length.0;
                 let (side, focus_dpt) = (if f_m > 0.0 { "in front of" } else { "behind" }, f_m / (eyepiece_m * eyepiece_m));
@@ -110,10 +104,17 @@ impl Sight {
                      and {y_px} px above it; the square is up and to the right"
                 ));
             }
-            Pattern::FieldIdentity { .. } => notes.extend(identity_notes(pattern, rig, &fields)?),
+            Pattern::FieldIdentity { .. } => notes.extend(identity_notes(pattern, rig, encoder, &fields)?),
         }
         if !spots.is_empty() {
-            let longest = optics.longest();
+            if !matches!(pattern, Pattern::Level { .. }) {
+                notes.push(
+                    "the light is that of the levels which the panel is sent, on pixels without gaps (a fill factor of \
+                     1); the rest of it goes to orders that are not listed"
+                        .into(),
+                );
+            }
+            let longest = rig.stop_colour();
             notes.push(format!(
                 "the stop of the relay, one for all colours and set for {longest}, lets spots up to {:.3} mm right, \
                  left, up and down through",
@@ -124,17 +125,67 @@ impl Sight {
     }
 }
 
-/// Where the diode goes, and what it sees when lasers and fields are exchanged.
-fn identity_notes(pattern: &Pattern, rig: &Rig, fields: &[Colour]) -> Result<Vec<String>, PatternError> {
+/// What of a lens is left by panel and stop, and how sharp that makes its focus.
+fn lens_note(
+    pattern: &Pattern,
+    focal_length_m: f64,
+    axis_px: [f64; 2],
+    rig: &Rig,
+    field: Colour,
+) -> Result<String, PatternError> {
     let optics = &rig.geometry;
+    let diameter_m = pattern.lens_diameter(optics, field)?.0;
+    let wave_m2 = optics.wavelengths[field].0 * focal_length_m.abs();
+    // What the stop passes are slopes of the phase, in x and in y.
+    let passed_m = 2.0 * wave_m2 * stop_frequency(rig, field);
+    let panel_px = [optics.resolution.width, optics.resolution.height];
+    // Across and up: what of so many metres around the axis lies on the panel.
+    let on_panel_m = |size_m: f64| {
+        [0, 1].map(|side| {
+            let axis_m = axis_px[side] * optics.pixel_pitch.0;
+            let edge_m = 0.5 * panel_px[side] as f64 * optics.pixel_pitch.0;
+            (0.5 * size_m).min(edge_m - axis_m) + (0.5 * size_m).min(edge_m + axis_m)
+        })
+    };
+    let lies_m = on_panel_m(diameter_m);
+    let (on_panel, left_m) = match lies_m.iter().any(|lies_m| *lies_m < diameter_m * (1.0 - 1e-9)) {
+        true => (format!(", of which {:.3} x {:.3} mm lie on the panel", 1e3 * lies_m[0], 1e3 * lies_m[1]), lies_m),
+        false => (String::new(), [diameter_m; 2]),
+    };
+    let through_m = on_panel_m(diameter_m.min(passed_m));
+    let (passed, left_m) = match (diameter_m > passed_m, on_panel.is_empty()) {
+        (true, true) => (format!(", of which the stop passes a square of {:.3} mm", 1e3 * passed_m), through_m),
+        (true, false) => {
+            (format!(", of which the stop passes {:.3} x {:.3} mm", 1e3 * through_m[0], 1e3 * through_m[1]), through_m)
+        }
+        (false, _) => (String::new(), left_m),
+    };
+    let radius_um = |width_m: f64| 1e6 * wave_m2 / width_m;
+    let focus = match (on_panel.is_empty(), passed.is_empty()) {
+        (true, true) => format!("a radius of {:.1} µm", 1.22 * radius_um(diameter_m)),
+        (true, false) => format!("a radius of {:.1} µm", radius_um(passed_m)),
+        (false, _) => {
+            format!("a radius of {:.1} µm across and {:.1} µm up", radius_um(left_m[0]), radius_um(left_m[1]))
+        }
+    };
+    Ok(format!("{field}: a lens of {:.3} mm{on_panel}{passed}; its focus has {focus}", 1e3 * diameter_m))
+}
+
+/// Where the diode goes, and what it sees when lasers and fields are exchanged.
+fn identity_notes(
+    pattern: &Pattern,
+    rig: &Rig,
+    encoder: &PanelEncoder,
+    fields: &[Colour],
+) -> Result<Vec<String>, PatternError> {
     let mut notes = Vec::new();
     for &field in fields {
-        let own = pattern.orders(optics, field, field)?[0];
+        let own = pattern.orders(rig, encoder, field, field)?[0];
         let radius_mm = radius_m(&own) * 1e3;
         let mut nearest_mm = f64::INFINITY;
         let mut strays = Vec::new();
         for laser in Colour::ALL.into_iter().filter(|&laser| laser != field) {
-            let stray = pattern.orders(optics, field, laser)?[0];
+            let stray = pattern.orders(rig, encoder, field, laser)?[0];
             let stray_mm = radius_m(&stray) * 1e3;
             nearest_mm = nearest_mm.min((stray_mm - radius_mm).abs());
             strays.push(format!("{laser} light would be {stray_mm:.3} mm from the axis, {:.0} %", stray.share * 100.0));
@@ -214,6 +265,38 @@ mod tests {
 
     use super::*;
 
+    fn encoder_of(rig: &Rig) -> PanelEncoder {
+        PanelEncoder::new(&rig.panel, rig.resolution(), rig.resolution()).unwrap()
+    }
+
+    #[test]
+    fn a_lens_beside_the_panels_middle_is_as_sharp_as_what_of_it_is_on_the_panel() {
+        let rig = Rig::default();
+        let notes = |axis_px: [f64; 2], focal_length_m: f64| {
+            let placement = Placement { axis_px, colours: PerColour([false, true, false]) };
+            let pattern = Pattern::Lens { focal_length: Metres(focal_length_m), diameter: None };
+            Sight::of(&pattern, &placement, &rig, &encoder_of(&rig)).unwrap().notes.join("\n")
+        };
+        // 8.64 mm; of its right half the 160 px between its axis and the edge. 520 nm · 1 m over 5.6 and 8.64 mm.
+        let cut = notes([800.0, 0.0], 1.0);
+        assert!(
+            cut.contains(
+                "a lens of 8.640 mm, of which 5.600 x 8.640 mm lie on the panel; its focus has a radius of 92.9 µm across \
+                 and 60.2 µm up"
+            ),
+            "{cut}"
+        );
+        let whole = notes([420.0, 0.0], 1.0);
+        assert!(whole.contains("a lens of 8.640 mm; its focus has a radius of 73.4 µm"), "{whole}");
+        // At the edge half of the stop's square of 1.994 mm is left across.
+        let both = notes([960.0, 0.0], 0.05);
+        assert!(
+            both.contains("1.625 x 3.250 mm lie on the panel, of which the stop passes 0.997 x 1.994 mm")
+                && both.contains("26.1 µm across and 13.0 µm up"),
+            "{both}"
+        );
+    }
+
     #[test]
     fn a_lens_is_as_sharp_as_what_the_stop_leaves_of_it() {
         let rig = Rig::default();
@@ -221,7 +304,7 @@ mod tests {
         let lens_notes = |diameter_mm: Option<f64>| {
             let pattern =
                 Pattern::Lens { focal_length: Metres(0.05), diameter: diameter_mm.map(|mm| Metres(1e-3 * mm)) };
-            Sight::of(&pattern, &placement, &rig).unwrap().notes.join("\n")
+            Sight::of(&pattern, &placement, &rig, &encoder_of(&rig)).unwrap().notes.join("\n")
         };
         // Of 520 nm and 8 µm: λf/p is 3.25 mm. The stop is set for 638 nm, which passes 1.99 mm.
         let largest = lens_notes(None);
@@ -238,7 +321,7 @@ mod tests {
         assert!(small.contains("a lens of 1.000 mm; its focus has a radius of 31.7 µm"), "{small}");
         for (focal_length_mm, sharp) in [(0.016, true), (0.0161, false), (-0.01, false)] {
             let pattern = Pattern::Lens { focal_length: Metres(focal_length_mm), diameter: None };
-            let notes = Sight::of(&pattern, &placement, &rig).unwrap().notes.join("\n");
+            let notes = Sight::of(&pattern, &placement, &rig, &encoder_of(&rig)).unwrap().notes.join("\n");
             assert_eq!(notes.contains("a camera in the display sees it sharp at 10.00 dioptres"), sharp, "{notes}");
         }
     }
