@@ -299,7 +299,8 @@ impl RefusalWatch {
             Rejection::OtherEye => {
                 let eye = if self.eye == rig::Eye::Left { "right" } else { "left" };
                 format!(
-                    "its samples are of the {eye} eye, and the rig follows the {}: set tracker.eye = \"{eye}\"",
+                    "its samples are of the {eye} eye, and this run follows the {}: give --eye {eye} or `holod ctl eye \
+                     {eye}`, or set tracker.eye = \"{eye}\" in the rig file",
                     self.eye.name()
                 )
             }
@@ -319,9 +320,13 @@ impl RefusalWatch {
         let shown = significant(figure);
         let (least_mm, greatest_mm) = (self.limits.least_mm, self.limits.greatest_mm);
         if self.proven {
+            let raw = figure / self.figures.mm_per_unit;
+            let of_raw =
+                if raw == mm { String::new() } else { format!(", which the tracker sends as {}", significant(raw)) };
             return format!(
-                "{shown}: no pupil's diameter ({least_mm} to {greatest_mm} mm), though samples were believed before: does \
-                 the tracker see the pupil?"
+                "{} mm{of_raw}: no pupil's diameter ({least_mm} to {greatest_mm} mm), though samples were believed before: \
+                 does the tracker see the pupil?",
+                significant(mm)
             );
         }
         if figure == 0.0 {
@@ -795,8 +800,15 @@ mod tests {
         let collapsed = |k: i64| PupilSample { diameter_mm: if k < 800 { 3.6 } else { 0.5 }, ..sample(k) };
         let said = told(&settings(), 1400, collapsed);
         let [(_, RefusalChange::Refused(refusal))] = &said[..] else { panic!("{said:?}") };
-        assert!(refusal.advice.starts_with("0.5: no pupil's diameter (1 to 9 mm)"), "{refusal}");
+        assert!(refusal.advice.starts_with("0.5 mm: no pupil's diameter (1 to 9 mm)"), "{refusal}");
         assert!(!refusal.advice.contains("scale"), "{refusal}");
+        let scaled = rig::Tracker { scale: Some(0.5), ..settings() };
+        let said = told(&scaled, 1400, collapsed);
+        let [(_, RefusalChange::Refused(refusal))] = &said[..] else { panic!("{said:?}") };
+        assert!(
+            refusal.advice.starts_with("0.5 mm, which the tracker sends as 1: no pupil's diameter (1 to 9 mm)"),
+            "{refusal}"
+        );
     }
 
     #[test]
@@ -807,7 +819,7 @@ mod tests {
             (|_, s| s.valid = false, "sees no pupil"),
             (|_, s| s.confidence = 0.3, "confidence is 0.30"),
             (|_, s| s.aperture_mm = Some(0.4), "lids are 0.40 mm apart"),
-            (|_, s| s.eye = SampleEye::Right, "tracker.eye = \"right\""),
+            (|_, s| s.eye = SampleEye::Right, "this run follows the left: give --eye right or `holod ctl eye right`"),
             // A clock that seems to stand is found to have been reset again and again.
             (|k, s| (s.t_device, s.t_sample) = (TimeNs(5_000 * k), TimeNs(k / 60 * 300 * MS + k % 60)), "5 µs"),
             (|k, s| (s.t_device, s.t_sample) = (TimeNs(5_000 * MS * k), TimeNs(5_000 * MS * k)), "5 s"),

@@ -167,6 +167,47 @@ fn what_a_person_put_out_stays_dark_after_a_failure_and_is_lit_after_an_end_in_o
     assert!(daemon.wait(Duration::from_secs(20)).status.success());
 }
 
+/// A service and a run by hand have no folder in common but the shared one.
+#[test]
+fn what_a_person_put_out_of_a_service_stays_dark_by_hand_and_the_other_way() {
+    const AS_SERVICE: &str = "SYSTEMD_EXEC_PID=$$ STATE_DIRECTORY=\"$PWD/state\" exec \"$0\" \"$@\"";
+    let start = |laser_box: &LaserBench, of_service: bool| {
+        let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64"];
+        let folder = laser_box.folder.path();
+        let runtime = folder.join(format!("runtime-{of_service}"));
+        fs::create_dir_all(&runtime).unwrap();
+        let environment =
+            [("XDG_RUNTIME_DIR", &*runtime), ("TMPDIR", &*runtime), ("HOLOD_DARK_NOTES", &*folder.join("state"))];
+        if of_service {
+            let args = [&["-c", AS_SERVICE, HOLOD], &args[..]].concat();
+            Daemon::start_with("/bin/sh", &args, folder, &environment)
+        } else {
+            Daemon::start_with(HOLOD, &args, folder, &environment)
+        }
+    };
+    for of_service in [false, true] {
+        let laser_box = LaserBench::plug_in();
+        let folder = laser_box.folder.path();
+        fs::create_dir(folder.join("state")).unwrap();
+        let first = start(&laser_box, of_service);
+        assert!(wait_until(Duration::from_secs(30), || laser_box.edges().len() > 60), "lit at first");
+        let runtime = folder.join(format!("runtime-{of_service}"));
+        let asked = Daemon::start_with(HOLOD, &["ctl", "lasers", "dark"], folder, &[("XDG_RUNTIME_DIR", &runtime)]);
+        let asked = asked.wait(Duration::from_secs(20));
+        assert!(asked.status.success(), "{}", asked.stderr);
+        first.signal(Signal::KILL);
+        drop(first);
+        let lit_before = laser_box.edges().len();
+
+        let second = start(&laser_box, !of_service);
+        thread::sleep(Duration::from_secs(3));
+        second.signal(Signal::TERM);
+        let ended = second.wait(Duration::from_secs(20));
+        assert!(ended.stderr.contains("the lasers stay dark"), "first a service: {of_service}; {}", ended.stderr);
+        assert_eq!(laser_box.edges().len(), lit_before, "nothing was lit since");
+    }
+}
+
 #[test]
 fn fields_are_dark_for_what_keeps_the_box_from_being_armed() {
     for (reason, is_by_hand) in [("interlock", false), ("by-hand", true)] {

@@ -45,6 +45,7 @@ impl Daemon {
             .args(args)
             .env("XDG_RUNTIME_DIR", folder)
             .env("TMPDIR", folder)
+            .env("HOLOD_DARK_NOTES", folder)
             .env_remove("RUNTIME_DIRECTORY")
             .envs(environment.iter().copied())
             .current_dir(folder)

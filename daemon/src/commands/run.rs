@@ -1,10 +1,10 @@
 //! `holod run`: the daemon, and a report that is shown again.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use holod_calibration::rig::Rig;
+use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_pupil_input::{RecordFiles, ReplaySpeed, Tracker, TrackerSpec};
 use holod_slm_output::OutputSpec;
 use serde::Serialize;
@@ -43,6 +43,9 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         bug_report::refuse_archive(path)?;
     }
     tracing::info!("{}: tracker {tracker}, panel {output} of {}", rig.name, rig.resolution());
+    if let Some(folder) = args.record.as_ref().filter(|_| args.force) {
+        RecordFolder::refuse_as_inputs(folder, inputs(args, &rig, &tracker))?;
+    }
     for warning in rig.warnings() {
         tracing::warn!("{warning}");
     }
@@ -108,6 +111,18 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         tracing::error!("{lost}");
     }
     told.and_then(|()| health.judge())
+}
+
+/// The files and folders that a run reads, with the option that names each.
+fn inputs(args: &RunArgs, rig: &Rig, tracker: &TrackerSpec) -> Vec<(&'static str, PathBuf)> {
+    let config = args.rig.config.iter().map(|path| ("--config", path.clone()));
+    let weights = match &rig.model.weights {
+        WeightsChoice::File(path) => Some(("--weights", path.clone())),
+        _ => None,
+    };
+    let scene = args.scene.scene.iter().flat_map(|scene| scene.split(',')).map(|path| ("--scene", path.into()));
+    let tracker = tracker.files().into_iter().map(|path| ("--tracker", path));
+    config.chain(weights).chain(scene).chain(tracker).collect()
 }
 
 /// Refuses what `run` would by its options and its rig alone. Devices are not opened; files that are not there may be

@@ -83,7 +83,7 @@ impl Preparer {
             Request::LasersDark {} => {
                 let wish = self.lasers.wish_dark();
                 // Here, too: a control thread that hangs is ended by the watchdog.
-                let _is_noted = self.dark_note.leave();
+                let _left = self.dark_note.leave();
                 Ok(Order::LasersDark(wish))
             }
             Request::LasersArm {} => Ok(Order::LasersArm),

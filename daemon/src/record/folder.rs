@@ -67,6 +67,33 @@ impl RecordFolder {
         Ok(Self { path: path.to_owned(), is_new, earlier_waits: !earlier.is_empty(), is_kept: false, _lock: lock })
     }
 
+    /// Refuses inputs of a run that are files of the record at `path`, which [`Self::claim`] with `force` would move
+    /// away before they are read; a directory that has such a file in it, too.
+    ///
+    /// # Errors
+    /// One of the inputs is.
+    pub(crate) fn refuse_as_inputs<'a>(
+        path: &Path,
+        inputs: impl IntoIterator<Item = (&'a str, PathBuf)>,
+    ) -> Result<(), Failure> {
+        let of_record: Vec<_> =
+            files_of(path).unwrap_or_default().iter().filter_map(|file| path.join(file).canonicalize().ok()).collect();
+        for (option, input) in inputs {
+            if let Ok(whole) = input.canonicalize()
+                && of_record.iter().any(|file| *file == whole || whole.is_dir() && file.parent() == Some(&*whole))
+            {
+                let what = format!(
+                    "{option}: {} is of the record in {}, which --force overwrites; record into another directory, or copy \
+                     the file elsewhere and name the copy",
+                    input.display(),
+                    path.display()
+                );
+                return Err(Failure::new(Exit::Usage, what));
+            }
+        }
+        Ok(())
+    }
+
     /// A folder of its own in `parent` for a run that starts `now`, whose name is the time.
     ///
     /// # Errors
@@ -375,6 +402,23 @@ mod tests {
         assert!(failure.to_string().contains("log.txt is a directory"), "{failure}");
         assert!(holds(folder.path(), &OF_RECORD, "old") && folder.path().join("log.txt").is_dir());
         assert!(!folder.path().join(MOVING).exists());
+    }
+
+    #[test]
+    fn files_of_the_record_that_goes_are_no_inputs() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("rec");
+        put(&folder, &OF_RECORD, "old");
+        put(&folder, &["scene/scene.toml", "own.toml"], "mine");
+        let judge = |name: &str| RecordFolder::refuse_as_inputs(&folder, [("--tracker", folder.join(name))]);
+        for name in ["tracker.holodraw", "samples.csv", "bench/rig.toml", "bench", "scene/../bench/rig.toml"] {
+            let failure = judge(name).unwrap_err();
+            assert_eq!(failure.exit, Exit::Usage, "{name}");
+            assert!(failure.to_string().contains("which --force overwrites; record into another"), "{failure}");
+        }
+        for name in ["own.toml", "scene", "missing", ".."] {
+            judge(name).unwrap();
+        }
     }
 
     #[test]

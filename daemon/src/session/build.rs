@@ -31,7 +31,7 @@ use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
 use super::watch::{Announced, Limits, Names, Rings, Watch};
 use crate::control::{self, Preparer, Steering};
-use crate::dark_note::DarkNote;
+use crate::dark_note::{DarkNote, Found};
 use crate::failure::{Exit, Failure};
 use crate::record::FrameOrders;
 use crate::renderer::{self, Renderer, Use};
@@ -140,13 +140,21 @@ pub(super) fn build(
     })?;
     output.control.attend();
     let dark_note = DarkNote::on(&rig.lasers.driver);
-    let keeps_dark = dark_note.is_there();
-    if keeps_dark {
+    let found = dark_note.look();
+    if !matches!(found, Found::Nothing) {
         output.control.keep_dark(Some(DarkReason::Asked));
-        tracing::warn!(
-            "the lasers stay dark: `holod ctl lasers dark` put them out before this holod was started; `holod ctl lasers \
-             arm` lets them be lit"
-        );
+    }
+    match &found {
+        Found::Nothing => {}
+        Found::Note(note) => tracing::warn!(
+            "the lasers stay dark: `holod ctl lasers dark` put them out before this holod was started, as {} says; `holod \
+             ctl lasers arm` lets them be lit",
+            note.display()
+        ),
+        Found::Unreadable(error) => tracing::warn!(
+            "the lasers stay dark: it cannot be known whether `holod ctl lasers dark` put them out before this holod was \
+             started: {error}; let this user read that folder, or look whether they may be lit: `holod ctl lasers arm`"
+        ),
     }
     if let LaserDriver::Serial { path, .. } = &rig.lasers.driver
         && let Some(warning) = adapter_delay_warning("laser", path)
@@ -252,7 +260,7 @@ pub(super) fn build(
         feed,
         feed_watch: FeedWatch::new(dark_after, t_origin),
         record: plan.record,
-        desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }, keeps_dark),
+        desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }, &found),
         signals,
         hangups: plan.hangups,
         service,

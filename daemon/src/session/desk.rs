@@ -8,7 +8,7 @@ use holod_calibration::rig::WeightsChoice;
 
 use super::frame_loop::Change;
 use crate::control::{ControlServer, Ordered, Preparer, Steering};
-use crate::dark_note::DarkNote;
+use crate::dark_note::{DarkNote, Found, Left};
 use crate::memory;
 use crate::runtime_folder;
 use crate::source::PictureSink;
@@ -28,8 +28,12 @@ pub(super) struct Changes {
 pub(super) struct Desk {
     server: Option<(ControlServer, mpsc::Receiver<Ordered>)>,
     pub(super) changes: Changes,
-    pub(super) keeps_dark: bool,
+    keeps_dark: bool,
     pub(super) dark_note: DarkNote,
+    /// A person is known to have asked for the darkness.
+    is_dark_by_order: bool,
+    /// It was said that the note on it cannot be left.
+    note_is_refused: bool,
     /// Orders that took effect: lines of `orders.jsonl`.
     pub(super) orders: u32,
     /// What is shown in place of holograms.
@@ -37,9 +41,9 @@ pub(super) struct Desk {
 }
 
 impl Desk {
-    /// A run goes on without one where it cannot be had, and says so. `keeps_dark`: the lasers are kept dark from the
-    /// beginning.
-    pub(super) fn open(preparer: Preparer, changes: Changes, keeps_dark: bool) -> Self {
+    /// A run goes on without one where it cannot be had, and says so. `found`: whether the lasers are kept dark from
+    /// the beginning.
+    pub(super) fn open(preparer: Preparer, changes: Changes, found: &Found) -> Self {
         let dark_note = preparer.dark_note.clone();
         let server = runtime_folder::own()
             .ok_or_else(|| "no folder for it".into())
@@ -51,7 +55,38 @@ impl Desk {
                 None
             }
         };
-        Self { server, changes, keeps_dark, dark_note, orders: 0, pattern: None }
+        let keeps_dark = !matches!(found, Found::Nothing);
+        let is_dark_by_order = matches!(found, Found::Note(_));
+        let note_is_refused = false;
+        Self { server, changes, keeps_dark, dark_note, is_dark_by_order, note_is_refused, orders: 0, pattern: None }
+    }
+
+    /// A person asked for dark lasers, or takes that back. What became of the note on it.
+    pub(super) fn keep_dark(&mut self) -> Left {
+        (self.keeps_dark, self.is_dark_by_order) = (true, true);
+        self.leave_note()
+    }
+
+    /// Which notes stay all the same.
+    pub(super) fn arm(&mut self) -> Option<String> {
+        (self.keeps_dark, self.is_dark_by_order) = (false, false);
+        self.dark_note.take_away()
+    }
+
+    /// Leaves the note again where its folder was taken away while the run goes on.
+    pub(super) fn keep_note(&mut self) {
+        if self.is_dark_by_order {
+            self.leave_note();
+        }
+    }
+
+    fn leave_note(&mut self) -> Left {
+        let left = self.dark_note.leave();
+        if let Some(error) = left.error.as_ref().filter(|_| !self.note_is_refused) {
+            tracing::warn!("a holod that starts after a failure would light the lasers: {error}");
+        }
+        self.note_is_refused = left.error.is_some();
+        left
     }
 
     pub(super) fn socket(&self) -> Option<PathBuf> {

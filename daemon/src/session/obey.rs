@@ -23,6 +23,10 @@ const ORDERS_AT_ONCE: usize = 4;
 
 const BUSY: &str = "the frame loop has not taken the last change yet: ask again";
 
+/// Of a note that lies in the runtime folder alone.
+const UNSEEN: &str = "; the service, or a run of another user, does not see that, because no note can be left in a folder \
+                      that they share: `systemctl stop holod`, or a user who can write to /run/lock, keeps them dark there";
+
 impl Watch<'_> {
     /// Obeys what has been asked for; whether that is to end.
     pub(super) fn obey(&mut self, output: &OutputControl) -> Result<bool, Failure> {
@@ -183,17 +187,18 @@ impl Watch<'_> {
     }
 
     fn lasers_dark(&mut self, wish: DarkWish, output: &OutputControl) -> Result<Value, String> {
-        self.desk.keeps_dark = true;
+        // Before the note, which a disk may make wait.
         let acknowledged = output.keep_dark_as_wished(wish);
-        let is_noted = self.desk.dark_note.leave();
+        let left = self.desk.keep_dark();
         if acknowledged {
-            let said = if is_noted {
+            let said = if left.is_there {
                 "the lasers are dark, and stay so until `holod ctl lasers arm`, also where holod fails, or as a service is \
                  restarted; a run by hand that was ended in order lights them when it is started again"
             } else {
                 "the lasers are dark, and stay so until `holod ctl lasers arm` or a new start of holod"
             };
-            return Ok(said.into());
+            let who = if left.is_there && !left.is_for_all { UNSEEN } else { "" };
+            return Ok(format!("{said}{who}").into());
         }
         Err("the laser box did not acknowledge darkness: look at the lasers, and switch them off by hand. holod lights \
              none until `holod ctl lasers arm`"
@@ -201,15 +206,16 @@ impl Watch<'_> {
     }
 
     fn lasers_arm(&mut self, output: &OutputControl) -> Value {
-        self.desk.keeps_dark = false;
-        self.desk.dark_note.take_away();
+        let stays = self.desk.arm().map_or(String::new(), |stays| {
+            format!("; a holod that is started anew keeps them dark all the same: {stays}")
+        });
         output.keep_dark(self.dark_wish());
         if self.feed_watch.keeps_dark() {
-            return "lasers are lit again by the rules, once the live feed gives a picture".into();
+            return format!("lasers are lit again by the rules, once the live feed gives a picture{stays}").into();
         }
         let trouble =
             self.laser_box.trouble().map_or(String::new(), |trouble| format!(" once this is over: {trouble}"));
-        format!("lasers are lit again by the rules{trouble}{}", self.pattern_warning()).into()
+        format!("lasers are lit again by the rules{trouble}{}{stays}", self.pattern_warning()).into()
     }
 }
 

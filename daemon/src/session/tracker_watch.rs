@@ -10,6 +10,8 @@ const STRANGERS: &str = "datagrams of another sender than the tracker's come to 
 /// Follows the tracker, and says in the log what changes.
 pub(super) struct TrackerWatch {
     refusals: RefusalWatch,
+    /// Settings that the tracker's thread may not have taken yet.
+    changing: Option<rig::Tracker>,
     clock: ClockWatch,
     /// Why a lost link does not come back.
     lost: Option<String>,
@@ -21,6 +23,7 @@ impl TrackerWatch {
     pub(super) fn new(settings: &rig::Tracker, figures: Figures, began: TimeNs) -> Self {
         Self {
             refusals: RefusalWatch::new(settings, figures, began),
+            changing: None,
             clock: ClockWatch::default(),
             lost: None,
             strangers_told: false,
@@ -30,6 +33,7 @@ impl TrackerWatch {
     /// The tracker goes on with other settings.
     pub(super) fn change(&mut self, settings: &rig::Tracker, tracker: &TrackerControl) {
         self.refusals.change(settings, &tracker.counters());
+        self.changing = Some(settings.clone());
     }
 
     /// The gate decided on a sample.
@@ -59,6 +63,14 @@ impl TrackerWatch {
 
     /// Finds out whether everything that has come is refused.
     pub(super) fn judge(&mut self, tracker: &TrackerControl, now: TimeNs) {
+        if let Some(settings) = &self.changing {
+            if tracker.is_changing() {
+                return;
+            }
+            // Samples that were believed by the settings before say nothing of these.
+            self.refusals.change(settings, &tracker.counters());
+            self.changing = None;
+        }
         match self.refusals.judge(now, &tracker.counters(), tracker.finished()) {
             Some(RefusalChange::Refused(refusal)) => tracing::warn!("the tracker: {refusal}"),
             Some(RefusalChange::Believed) => tracing::info!("the tracker: samples are believed"),

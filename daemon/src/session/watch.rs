@@ -191,6 +191,7 @@ impl Watch<'_> {
             if ticks.is_multiple_of(TICKS_PER_STATUS) {
                 self.frames_shown_hz = self.frame_rate.at(self.tally.frames_shown, now);
                 self.write_status(&output.counts(), now);
+                self.desk.keep_note();
             }
             self.signals.tell_of_suspension();
             if let Some(signal) = self.signals.caught() {

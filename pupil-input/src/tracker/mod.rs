@@ -425,6 +425,11 @@ impl TrackerControl {
         Ok(needless_scale("the tracker", unit, settings))
     }
 
+    /// A change waits for the thread: what is counted is still decided by the settings before it.
+    pub fn is_changing(&self) -> bool {
+        !self.finished() && self.changes.slots() < self.changes.buffer().capacity()
+    }
+
     /// How the recording goes, where there is one.
     pub fn recording(&self) -> Option<RecordStatus> {
         self.recorder.as_ref().map(Recorder::status)

@@ -352,9 +352,11 @@ impl Worker {
 
     /// Takes a change of settings; false if the tracker is to stop.
     fn goes_on(&mut self) -> bool {
-        while let Ok(settings) = self.changes.pop() {
+        while let Ok(&settings) = self.changes.peek() {
             let t = self.clock.to_stream(host_now());
             self.note_decisions(|estimator, tap| estimator.change(settings, t, |decision| tap.note(decision)));
+            // Only now, so that whoever finds it taken counts no decision by the settings before it.
+            let _ = self.changes.pop();
             self.publish();
         }
         !self.shared.stop.load(Ordering::Acquire)
