@@ -236,8 +236,8 @@ fn results_are_overwritten_by_force_only_and_by_the_same_rule_everywhere() {
             run(HOLOD, &["demo", "--duration", "8s", "--resolution", "128x128", "--weights", "small"], folder.path());
         assert!(ended.status.success() && at(name).join("eye.png").is_file(), "{}", ended.stderr);
         assert!(ended.stdout.contains(name), "{}", ended.stdout);
-        let pupils = ended.stdout.lines().filter_map(|line| line.strip_prefix("  pupil ")?.split(' ').next());
-        let widest = format!("the widest pupil kept, {} mm: ", pupils.last().unwrap());
+        let mut pupils = ended.stdout.lines().filter_map(|line| line.strip_prefix("  pupil ")?.split(' ').next());
+        let widest = format!("the widest pupil kept, {} mm: ", pupils.next_back().unwrap());
         assert!(ended.stdout.contains(&widest), "{widest}: {}", ended.stdout);
     }
 }
