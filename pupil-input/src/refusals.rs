@@ -806,7 +806,7 @@ mod tests {
         let said = told(&scaled, 1400, collapsed);
         let [(_, RefusalChange::Refused(refusal))] = &said[..] else { panic!("{said:?}") };
         assert!(
-            refusal.advice.starts_with("0.5 mm, which the tracker sends as 1: no pupil's diameter (1 to 9 mm)"),
+            refusal.advice.starts_with("0.25 mm, which the tracker sends as 0.5: no pupil's diameter (1 to 9 mm)"),
             "{refusal}"
         );
     }

@@ -702,12 +702,12 @@ mod tests {
             }
         }
         // The textbook's figures: (2/π)², J₁² at its largest, and half of the first order for half a blaze.
-        let first = |pattern: &Pattern| orders(&pattern, Colour::Red, Colour::Red).unwrap()[0].share;
+        let first = |pattern: &Pattern| orders(pattern, Colour::Red, Colour::Red).unwrap()[0].share;
         assert!((first(&grating(64.0, 0.0, Profile::Binary)) - 0.4053).abs() < 1e-3);
         assert!((first(&sinusoidal) - 0.3386 * envelope([1.0 / 32.0, 0.0])).abs() < 1e-3);
         assert!((first(&shallow) - 0.4053).abs() < 2e-3);
         // One pixel of three, or two of five, less the others.
-        let middle = |pattern: &Pattern| orders(&pattern, Colour::Red, Colour::Red).unwrap()[1].share;
+        let middle = |pattern: &Pattern| orders(pattern, Colour::Red, Colour::Red).unwrap()[1].share;
         assert!((middle(&odd[0]) - 1.0 / 9.0).abs() < 1e-3 && (middle(&odd[2]) - 0.04).abs() < 1e-3);
     }
 
