@@ -428,7 +428,7 @@ fn what_is_no_report_is_said() {
     let mut damaged = whole.clone();
     let middle = damaged.len() / 2;
     damaged[middle] ^= 0x10;
-    for (name, bytes) in [("cut", &whole[..whole.len() / 2]), ("damaged", &damaged), ("short", &whole[..100])] {
+    for (name, bytes) in [("cut", &whole[..whole.len() / 2]), ("damaged", &damaged), ("short", &whole[..30])] {
         fs::write(bench.path(name), bytes).unwrap();
     }
     tar(&["czf", bench.path("other").to_str().unwrap(), "-C", bench.0.path().to_str().unwrap(), "scene"]);
