@@ -82,7 +82,7 @@ pub fn weights(rig: &Rig) -> Result<Weights, Failure> {
     Ok(weights)
 }
 
-/// The same for one pupil that is named: [`check_pupil`] refuses those outside the range.
+/// The same for one pupil that is named: `check_pupil` refuses those outside the range.
 pub fn weights_for_one_pupil(rig: &Rig) -> Result<Weights, Failure> {
     let weights = load_weights(rig)?;
     match weights.fit(&rig.geometry) {
