@@ -325,7 +325,7 @@ pub struct DemoArgs {
     /// The network.
     #[command(flatten)]
     pub network: NetworkArgs,
-    /// Size of the hologram in panel pixels; 512x512 when left out.
+    /// Size of the hologram in panel pixels; when left out 512x512, or what a smaller panel has.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
     pub resolution: Option<Resolution>,
     /// Directory for the pictures; holod-demo when left out, or holod-demo-2 and so on where that is there already.

@@ -4,8 +4,10 @@
 //! service: a restart is not told from a stop. A run by hand has it in its runtime folder, which nobody else looks into,
 //! and in the shared folders that take it, and takes it away at its end. Each looks in all of them.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::{ErrorKind, Write};
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::LaserDriver;
@@ -18,22 +20,33 @@ const SHARED_VARIABLE: &str = "HOLOD_DARK_NOTES";
 /// The state folder of the service's unit, and the folder for locks on devices, which the unit can see and, on Debian,
 /// every user can write to.
 const SHARED: &str = "/var/lib/holod:/run/lock";
+/// Where links to ports are.
+const LINK_FOLDERS: [&str; 3] = ["/dev", "/dev/serial/by-id", "/dev/serial/by-path"];
 
 /// The notes on one rig's lasers. Simulated ones have none.
+///
+/// There is one for each name that a port has: as the rig calls it, where that leads to, and the links that lead there,
+/// since another rig may call it so.
 #[derive(Clone, Debug)]
 pub(crate) struct DarkNote {
-    /// The ports that it is on, a line each.
-    ports: String,
-    /// What the names of all notes on them begin with, but for a `holod-` before it.
-    stem: String,
-    /// The name of this process's own.
-    name: String,
-    /// Where nobody but this user leaves one.
+    /// The lasers' ports as the rig names them.
+    ports: Vec<PathBuf>,
+    folders: Folders,
+    /// Where notes are looked for.
+    looked_at: Vec<PathBuf>,
+    of_service: bool,
+}
+
+#[derive(Clone, Debug, Default)]
+struct Folders {
+    /// Where nobody but this user, or this service, leaves one.
     own: Option<PathBuf>,
     /// Where others look for one of this process, too.
     shared: Vec<PathBuf>,
-    looked_at: Vec<PathBuf>,
-    of_service: bool,
+    /// Where another run of this user may have left one.
+    runtime: Vec<PathBuf>,
+    /// Where links to ports are.
+    links: Vec<PathBuf>,
 }
 
 /// What a look for notes came to.
@@ -61,35 +74,38 @@ impl DarkNote {
     pub(crate) fn on(driver: &LaserDriver) -> Self {
         let state = state_folder();
         let of_service = state.is_some();
-        let own = state.or_else(runtime_folder::own);
-        let shared = std::env::var_os(SHARED_VARIABLE).unwrap_or_else(|| SHARED.into());
-        let shared: Vec<_> = std::env::split_paths(&shared).filter(|folder| folder.is_absolute()).collect();
+        let named = std::env::var_os(SHARED_VARIABLE).filter(|named| !named.is_empty());
+        let shared = std::env::split_paths(&named.unwrap_or_else(|| SHARED.into()))
+            .filter_map(|folder| std::path::absolute(folder).ok())
+            .collect();
         let runtime = runtime_folder::candidates().into_iter().filter(|folder| runtime_folder::is_own(folder));
-        Self::in_folders(own, shared, runtime.collect(), driver, of_service)
+        let folders = Folders {
+            own: state.or_else(runtime_folder::own),
+            shared,
+            runtime: runtime.collect(),
+            links: LINK_FOLDERS.map(PathBuf::from).into(),
+        };
+        Self::in_folders(folders, driver, of_service)
     }
 
-    fn in_folders(
-        own: Option<PathBuf>,
-        shared: Vec<PathBuf>,
-        runtime: Vec<PathBuf>,
-        driver: &LaserDriver,
-        of_service: bool,
-    ) -> Self {
-        let whole = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-        let ports: String = driver.paths().iter().map(|path| format!("{}\n", whole(path).display())).collect();
-        let stem = format!("dark-{:016x}", XxHash3_64::oneshot(ports.as_bytes()));
-        let name =
-            if of_service { stem.clone() } else { format!("holod-{stem}-{}", rustix::process::getuid().as_raw()) };
+    fn in_folders(folders: Folders, driver: &LaserDriver, of_service: bool) -> Self {
+        let ports: Vec<_> = driver.paths().into_iter().map(Path::to_owned).collect();
         if ports.is_empty() {
-            return Self { ports, stem, name, own: None, shared: vec![], looked_at: vec![], of_service };
+            return Self { ports, folders: Folders::default(), looked_at: vec![], of_service };
         }
         let mut looked_at = Vec::new();
-        for folder in own.iter().chain(&shared).chain(&runtime) {
+        for folder in folders.own.iter().chain(&folders.shared).chain(&folders.runtime) {
             if !looked_at.contains(folder) {
                 looked_at.push(folder.clone());
             }
         }
-        Self { ports, stem, name, own, shared, looked_at, of_service }
+        Self { ports, folders, looked_at, of_service }
+    }
+
+    /// What is in each note, by what its name begins with, but for a `holod-` before it.
+    fn contents(&self) -> BTreeMap<String, String> {
+        let names = self.ports.iter().flat_map(|port| names_of(port, &self.folders.links));
+        names.map(|name| (stem(&[&name]), format!("{}\n", name.display()))).collect()
     }
 
     /// Looks whether a holod before this one, or another user's, left one.
@@ -104,12 +120,15 @@ impl DarkNote {
 
     /// All notes on these lasers, and why folders cannot be read.
     fn notes(&self) -> (Vec<PathBuf>, Vec<String>) {
+        let mut stems: Vec<_> = self.contents().into_keys().collect();
+        // An older holod left one for all ports together.
+        let ports: Vec<_> = self.ports.iter().map(|port| whole(port)).collect();
+        stems.push(stem(&ports.iter().map(PathBuf::as_path).collect::<Vec<_>>()));
+        let is_on_these = |name: &String| stems.iter().any(|stem| is_named(name, stem));
         let (mut notes, mut unreadable) = (Vec::new(), Vec::new());
         for folder in &self.looked_at {
             match names(folder) {
-                Ok(names) => {
-                    notes.extend(names.into_iter().filter(|name| self.is_on_these(name)).map(|n| folder.join(n)))
-                }
+                Ok(names) => notes.extend(names.into_iter().filter(is_on_these).map(|name| folder.join(name))),
                 Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {}
                 Err(error) => unreadable.push(format!("{}: {error}", folder.display())),
             }
@@ -117,44 +136,38 @@ impl DarkNote {
         (notes, unreadable)
     }
 
-    fn is_on_these(&self, name: &str) -> bool {
-        let rest = name.strip_prefix("holod-").unwrap_or(name).strip_prefix(&self.stem);
-        rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('-'))
-    }
-
     /// Leaves it wherever it is missing.
     pub(crate) fn leave(&self) -> Left {
+        let Folders { own, shared, .. } = &self.folders;
+        let contents = self.contents();
         let mut left = Left::default();
-        if let Some(own) = &self.own {
+        if let Some(own) = own {
             if !self.of_service {
                 let _is_made = runtime_folder::make_again(own);
             }
-            match self.leave_in(own) {
-                Ok(()) => (left.is_there, left.is_for_all) = (true, self.of_service),
+            match leave_in(own, &contents, |stem| self.own_name(stem)) {
+                Ok(()) => (left.is_there, left.is_for_all) = (true, shared.contains(own)),
                 Err(error) => left.error = Some(error),
             }
         }
-        if !self.of_service {
+        if !left.is_for_all {
             // Which of them takes one depends on the user.
-            let in_shared = self.shared.iter().filter(|folder| self.leave_in(folder).is_ok()).count();
-            if in_shared > 0 {
+            let is_left = |folder: &&PathBuf| leave_in(folder, &contents, |stem| self.shared_name(stem)).is_ok();
+            if shared.iter().filter(is_left).count() > 0 {
                 left = Left { is_there: true, is_for_all: true, error: None };
             }
         }
         left
     }
 
-    fn leave_in(&self, folder: &Path) -> Result<(), String> {
-        let path = folder.join(&self.name);
-        match fs::File::create_new(&path) {
-            Ok(mut file) => {
-                // That it is there counts; what is in it is for people.
-                let _ = file.write_all(self.ports.as_bytes());
-                Ok(())
-            }
-            Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(()),
-            Err(error) => Err(format!("{}: {error}", path.display())),
-        }
+    fn own_name(&self, stem: &str) -> String {
+        if self.of_service { stem.to_owned() } else { self.shared_name(stem) }
+    }
+
+    /// A run by hand must not take away that of a service of the same user.
+    fn shared_name(&self, stem: &str) -> String {
+        let service = if self.of_service { "service-" } else { "" };
+        format!("holod-{stem}-{service}{}", rustix::process::getuid().as_raw())
     }
 
     /// Takes all of them away, those of others, too. Which stay, and how to take them away.
@@ -174,12 +187,59 @@ impl DarkNote {
 
     /// Takes its own away at the end of a run by hand, after which its lasers are known to be dark.
     pub(crate) fn take_away_unless_of_service(&self) {
-        if !self.of_service {
-            for folder in self.own.iter().chain(&self.shared) {
-                let _not_there = fs::remove_file(folder.join(&self.name));
+        if self.of_service {
+            return;
+        }
+        for stem in self.contents().keys() {
+            for folder in self.folders.own.iter().chain(&self.folders.shared) {
+                let _not_there = fs::remove_file(folder.join(self.own_name(stem)));
             }
         }
     }
+}
+
+/// The names of a port: as it is called, where that leads to, and what else in `link_folders` leads there.
+fn names_of(port: &Path, link_folders: &[PathBuf]) -> Vec<PathBuf> {
+    let mut names = vec![whole(port)];
+    let Ok(device) = port.canonicalize() else { return names };
+    let entries = link_folders.iter().filter_map(|folder| fs::read_dir(folder).ok()).flatten().flatten();
+    let links = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink())).map(|link| link.path());
+    names.extend(links.filter(|link| link.canonicalize().is_ok_and(|leads_to| leads_to == device)));
+    names.push(device);
+    names
+}
+
+fn whole(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
+}
+
+/// What the name of a note on `ports` begins with.
+fn stem(ports: &[&Path]) -> String {
+    let lines: Vec<_> = ports.iter().flat_map(|port| [port.as_os_str().as_bytes(), b"\n"]).collect();
+    format!("dark-{:016x}", XxHash3_64::oneshot(&lines.concat()))
+}
+
+fn is_named(name: &str, stem: &str) -> bool {
+    let rest = name.strip_prefix("holod-").unwrap_or(name).strip_prefix(stem);
+    rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('-'))
+}
+
+/// Leaves notes of these contents in `folder`, where they are missing.
+fn leave_in(folder: &Path, contents: &BTreeMap<String, String>, name: impl Fn(&str) -> String) -> Result<(), String> {
+    for (stem, content) in contents {
+        let path = folder.join(name(stem));
+        // Only to look waits for no disk that stands still.
+        if path.symlink_metadata().is_ok() {
+            continue;
+        }
+        match fs::File::create_new(&path) {
+            // That it is there counts; what is in it is for people.
+            Ok(mut file) => drop(file.write_all(content.as_bytes())),
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(format!("{}: {error}", path.display())),
+        }
+    }
+    Ok(())
 }
 
 /// Names in a folder; those that are no text are none of a note.
@@ -197,8 +257,6 @@ fn state_folder() -> Option<PathBuf> {
 
 #[cfg(test)]
 mod tests {
-    use std::os::unix::fs::PermissionsExt;
-
     use holod_calibration::rig::Rig;
 
     use super::*;
@@ -209,7 +267,8 @@ mod tests {
     impl Machine {
         fn new() -> Self {
             let root = tempfile::tempdir().unwrap();
-            ["state", "runtime", "lock"].iter().for_each(|name| fs::create_dir(root.path().join(name)).unwrap());
+            let folders = ["state", "runtime", "lock", "dev"];
+            folders.iter().for_each(|name| fs::create_dir(root.path().join(name)).unwrap());
             Self(root)
         }
 
@@ -218,16 +277,11 @@ mod tests {
         }
 
         fn note(&self, driver: &LaserDriver, of_service: bool) -> DarkNote {
-            let own = self.at(if of_service { "state" } else { "runtime" });
-            // A user can write to the service's folder in no case, which `no-such-folder` stands for.
-            let shared = if of_service { vec![] } else { vec![self.at("no-such-folder"), self.at("lock")] };
-            let mut note = DarkNote::in_folders(Some(own), shared, vec![], driver, of_service);
-            if !note.looked_at.is_empty() {
-                note.looked_at = ["state", "runtime", "lock"].map(|name| self.at(name)).into();
-            }
-            // Of another user, whose runtime folder is not to be seen.
-            note.looked_at.retain(|folder| !of_service || *folder != self.at("runtime"));
-            note
+            let runtime = self.at("runtime");
+            let (own, runtime) = if of_service { (self.at("state"), vec![]) } else { (runtime.clone(), vec![runtime]) };
+            let shared = ["no-such-folder", "lock"].map(|name| self.at(name)).into();
+            let folders = Folders { own: Some(own), shared, runtime, links: vec![self.at("dev")] };
+            DarkNote::in_folders(folders, driver, of_service)
         }
 
         fn on(&self, port: &str, of_service: bool) -> DarkNote {
@@ -254,7 +308,8 @@ mod tests {
         let simulated = machine.note(&Rig::default().lasers.driver, false);
         assert!(!simulated.leave().is_there && matches!(simulated.look(), Found::Nothing));
         let mut nowhere = machine.on("/dev/left", true);
-        nowhere.own = Some("/proc/no-such-folder".into());
+        nowhere.folders.own = Some("/proc/no-such-folder".into());
+        nowhere.folders.shared.clear();
         let left = nowhere.leave();
         assert!(!left.is_there && left.error.is_some_and(|error| error.starts_with("/proc/no-such-folder/dark-")));
         assert!(!is_there(&nowhere));
@@ -281,7 +336,7 @@ mod tests {
     fn a_note_of_an_older_holod_in_the_runtime_folder_is_seen() {
         let machine = Machine::new();
         let note = machine.on("/dev/lasers", false);
-        fs::write(machine.at("runtime").join(&note.stem), "").unwrap();
+        fs::write(machine.at("runtime").join(stem(&[Path::new("/dev/lasers")])), "").unwrap();
         assert!(is_there(&note) && note.take_away().is_none() && !is_there(&note));
     }
 
@@ -289,7 +344,7 @@ mod tests {
     fn a_note_that_others_cannot_see_is_told_from_one_that_they_can() {
         let machine = Machine::new();
         let mut note = machine.on("/dev/lasers", false);
-        note.shared.pop();
+        note.folders.shared.pop();
         let left = note.leave();
         assert!(left.is_there && !left.is_for_all, "{left:?}");
     }
@@ -299,32 +354,72 @@ mod tests {
         let machine = Machine::new();
         let note = machine.on("/dev/lasers", false);
         note.leave();
+        let notes = || names(&machine.at("runtime")).unwrap();
+        let before = notes();
         fs::remove_dir_all(machine.at("runtime")).unwrap();
         note.leave();
-        assert!(machine.at("runtime").join(&note.name).exists());
+        assert_eq!((notes(), before.len()), (before, 1));
     }
 
     #[test]
     fn what_cannot_be_read_or_taken_away_is_told() {
-        if rustix::process::geteuid().is_root() {
-            return;
-        }
         let machine = Machine::new();
         let note = machine.on("/dev/lasers", false);
-        let lock = |mode| fs::set_permissions(machine.at("lock"), fs::Permissions::from_mode(mode)).unwrap();
-        lock(0);
+        let lock = machine.at("lock");
+        fs::remove_dir(&lock).unwrap();
+        std::os::unix::fs::symlink(&lock, &lock).unwrap();
         let (found, stays) = (note.look(), note.take_away());
-        lock(0o700);
-        let folder = machine.at("lock").display().to_string();
+        let folder = lock.display().to_string();
         assert!(matches!(&found, Found::Unreadable(error) if error.starts_with(&folder)), "{found:?}");
         assert!(stays.is_some_and(|stays| stays.starts_with(&folder)));
-        note.leave();
-        lock(0o500);
+        fs::remove_file(&lock).unwrap();
+        // As root may take any file away, and nobody a directory so.
+        let path = lock.join(format!("holod-{}-7", stem(&[Path::new("/dev/lasers")])));
+        fs::create_dir_all(&path).unwrap();
         let stays = note.take_away();
-        lock(0o700);
-        let path = machine.at("lock").join(&note.name).display().to_string();
-        assert!(stays.is_some_and(|stays| stays.ends_with(&format!("`sudo rm {path}`"))));
+        assert!(stays.is_some_and(|stays| stays.ends_with(&format!("`sudo rm {}`", path.display()))));
         assert!(is_there(&note));
+    }
+
+    #[test]
+    fn lasers_are_known_by_each_name_of_their_ports() {
+        let machine = Machine::new();
+        let port = |name: &str| machine.at("dev").join(name).display().to_string();
+        fs::write(port("ttyACM0"), "").unwrap();
+        fs::write(port("ttyACM1"), "").unwrap();
+        std::os::unix::fs::symlink("ttyACM0", port("lasers")).unwrap();
+        std::os::unix::fs::symlink(port("ttyACM0"), port("other")).unwrap();
+        for [named, also] in [["lasers", "ttyACM0"], ["ttyACM0", "lasers"], ["lasers", "other"]] {
+            let [named, also] = [named, also].map(|name| machine.on(&port(name), false));
+            assert!(named.leave().is_there);
+            assert!(is_there(&also) && matches!(machine.on(&port("ttyACM1"), false).look(), Found::Nothing));
+            // It is plugged out: links to it are gone.
+            fs::remove_file(port("ttyACM0")).unwrap();
+            assert!(is_there(&also) && is_there(&named));
+            fs::write(port("ttyACM0"), "").unwrap();
+            assert_eq!(named.take_away(), None);
+            assert!(!is_there(&also));
+        }
+    }
+
+    #[test]
+    fn some_of_several_ports_are_enough() {
+        let machine = Machine::new();
+        let on = |ports: &[&str]| {
+            let mut note = machine.on("/dev/lasers", true);
+            note.ports = ports.iter().map(PathBuf::from).collect();
+            note
+        };
+        let [all, green, other] = [on(&["/dev/red", "/dev/green"]), on(&["/dev/green"]), on(&["/dev/other"])];
+        all.leave();
+        assert!(is_there(&green) && !is_there(&other));
+        // Red's stays.
+        assert_eq!(green.take_away(), None);
+        assert!(is_there(&all) && !is_there(&green));
+        all.take_away();
+        let of_older_holod = stem(&[Path::new("/dev/red"), Path::new("/dev/green")]);
+        fs::write(machine.at("state").join(of_older_holod), "").unwrap();
+        assert!(is_there(&all));
     }
 
     #[test]

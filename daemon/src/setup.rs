@@ -87,8 +87,10 @@ pub fn weights_for_one_pupil(rig: &Rig) -> Result<Weights, Failure> {
     let weights = load_weights(rig)?;
     match weights.fit(&rig.geometry) {
         BenchFit::Inside => {}
-        BenchFit::Near(outside) => tracing::warn!("{outside}"),
-        BenchFit::Far(outside) => return Err(Failure::because(Exit::Config)(outside)),
+        BenchFit::Near(outside) => tracing::warn!("{}", outside.behind_relay(rig.relay_magnification)),
+        BenchFit::Far(outside) => {
+            return Err(Failure::because(Exit::Config)(outside.behind_relay(rig.relay_magnification)));
+        }
     }
     Ok(weights)
 }

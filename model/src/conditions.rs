@@ -109,6 +109,22 @@ pub struct InsideAt {
     pub depth_range_dpt: f64,
 }
 
+impl OutsideTraining {
+    /// The same where the focal length of the bench is that of the eyepiece over `relay_magnification`
+    /// ([`DisplayGeometry`]): what is said of the focal length is said of the eyepiece itself.
+    #[must_use]
+    pub fn behind_relay(mut self, relay_magnification: f64) -> Self {
+        let too_large = self.found_px2.iter().any(|&(_, px2)| px2 > self.trained_px2[1]);
+        if let Some(InsideAt { eyepiece_focal_length_mm, .. }) = &mut self.inside_at
+            && relay_magnification != 1.0
+        {
+            let steps = *eyepiece_focal_length_mm * relay_magnification / FOCAL_LENGTH_STEP_MM;
+            *eyepiece_focal_length_mm = FOCAL_LENGTH_STEP_MM * if too_large { steps.floor() } else { steps.ceil() };
+        }
+        self
+    }
+}
+
 impl fmt::Display for OutsideTraining {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let found: Vec<_> = self.found_px2.iter().map(|(colour, px2)| format!("{px2:.2} px² in {colour}")).collect();
@@ -270,6 +286,21 @@ mod tests {
             ] {
                 assert_eq!(TRAINED.fit(&bench), BenchFit::Inside, "{focal_length_mm} mm: {outside}");
             }
+        }
+        // Behind relays: what is said is to be written into the rig file.
+        for (focal_length_mm, magnification) in [(30.0, 0.5), (60.0, 1.7), (28.0, 1.3)] {
+            let behind = |focal_length_mm: f64| DisplayGeometry {
+                eyepiece_focal_length: Metres(1e-3 * focal_length_mm / magnification),
+                ..BENCH
+            };
+            let fit = TRAINED.fit(&behind(focal_length_mm));
+            let (BenchFit::Near(outside) | BenchFit::Far(outside)) = fit else {
+                panic!("{focal_length_mm} mm is inside")
+            };
+            let said = outside.behind_relay(magnification).to_string();
+            let written = said.split("a focal length of ").nth(1).unwrap().split(" mm").next().unwrap();
+            let inside = TRAINED.fit(&behind(written.parse().unwrap()));
+            assert_eq!(inside, BenchFit::Inside, "{focal_length_mm} mm, {magnification}: {said}");
         }
         let BenchFit::Near(low) = TRAINED.fit(&bench(40.0)) else { panic!("blue has 28 px²") };
         assert_eq!(low.found_px2.len(), 1);

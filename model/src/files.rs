@@ -90,7 +90,7 @@ pub struct BenchOptics {
     pub wavelengths_nm: [f64; 3],
     /// Distance between the centres of neighbouring pixels.
     pub pixel_pitch_um: f64,
-    /// Focal length of the eyepiece.
+    /// Focal length of the eyepiece, over the magnification of the relay before it.
     pub eyepiece_focal_length_mm: f64,
     /// Vergence of normalised depth 0.
     pub depth_far_dpt: f64,

@@ -188,14 +188,17 @@ impl ClockModel {
         let offset_ns = arrival.0.saturating_sub(device.0);
         // One far above is late, or the clock was set back; one far below is wrong, or the clock was set forward. The
         // samples will tell.
-        let late = self.line.noted > 0 && self.line.above(device, offset_ns) > STRAY_ABOVE.0;
+        let above_ns = if self.line.noted > 0 { self.line.above(device, offset_ns) } else { 0 };
+        let late = above_ns > STRAY_ABOVE.0;
         let early = self.samples.noted > 0 && self.samples.above(device, offset_ns) < -LONGEST_DELAY.0;
         if late || early {
             return;
         }
         self.line.note(device, offset_ns, arrival);
-        // The clock goes on as it did: samples far above their line have a longer delay than those before them.
-        if self.strays.is_some_and(|strays| self.samples.above(device, strays.offset_ns) > 0) {
+        // The clock goes on as it did where a reading says so that lies on the line itself: samples far above theirs have
+        // a longer delay than those before them.
+        let goes_on = above_ns.abs() < AGREEMENT.0;
+        if goes_on && self.strays.is_some_and(|strays| self.samples.above(device, strays.offset_ns) > 0) {
             self.strays = None;
             self.samples = Line::new();
         }

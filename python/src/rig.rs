@@ -205,7 +205,7 @@ impl Rig {
             rig.name,
             rig.resolution(),
             rig.pixel_pitch().0 * 1e6,
-            rig.geometry.eyepiece_focal_length.0 * 1e3,
+            rig.geometry.eyepiece_focal_length.0 * rig.relay_magnification * 1e3,
             rig.geometry.depth_far.0,
             rig.geometry.depth_near.0
         )

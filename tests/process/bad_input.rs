@@ -322,6 +322,17 @@ fn a_pipe_is_never_replaced_by_a_file() {
 }
 
 #[test]
+fn a_pipe_is_no_log() {
+    let folder = holod_tests::new_folder();
+    rustix::fs::mkfifoat(rustix::fs::CWD, folder.path().join("pipe"), Mode::RUSR | Mode::WUSR).unwrap();
+    for args in [&["--tracker", "replay:pipe", "--frames", "1"][..], &["log", "info", "pipe"]] {
+        let ended = run(HOLOD, args, folder.path());
+        assert!(ended.stderr.contains("a device or pipe"), "{args:?}: {ended:?}");
+        assert!(!ended.status.success(), "{args:?}");
+    }
+}
+
+#[test]
 fn a_record_is_never_overwritten() {
     let folder = holod_tests::new_folder();
     fs::create_dir(folder.path().join("record")).unwrap();

@@ -212,6 +212,7 @@ fn an_evaluation_says_what_computed_it_and_of_which_scenes() {
     assert!(hashes.iter().all(|hash| hash.len() == 16), "{hashes:?}");
     let checked = run(HOLOD, &["check", "--config", "rig.toml"], folder.path());
     assert!(checked.stdout.contains(&hashes[1]), "{} is not in {}", hashes[1], checked.stdout);
+    assert_eq!(file["rig_tables_xxh3"], serde_json::json!({}));
     let set = |kind: &str| serde_json::json!([{ "kind": kind, "seed": entry(&golden, "seed"), "indices": [0] }]);
     assert_eq!([&file["scene_sets"], &file["card_sets"]], [&set("test"), &set("cards")]);
     assert_eq!(file["mark_sets"], serde_json::json!([]));

@@ -167,17 +167,18 @@ fn what_a_person_put_out_stays_dark_after_a_failure_and_is_lit_after_an_end_in_o
     assert!(daemon.wait(Duration::from_secs(20)).status.success());
 }
 
-/// A service and a run by hand have no folder in common but the shared one.
+/// A service and a run by hand have no folder in common but the shared one, and call the port by other names.
 #[test]
 fn what_a_person_put_out_of_a_service_stays_dark_by_hand_and_the_other_way() {
     const AS_SERVICE: &str = "SYSTEMD_EXEC_PID=$$ STATE_DIRECTORY=\"$PWD/state\" exec \"$0\" \"$@\"";
     let start = |laser_box: &LaserBench, of_service: bool| {
-        let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64"];
         let folder = laser_box.folder.path();
+        let rig = if of_service { "rig.toml" } else { "by-hand.toml" };
+        let args = ["--config", rig, "--tracker", "mock:steady", "--resolution", "64x64"];
         let runtime = folder.join(format!("runtime-{of_service}"));
         fs::create_dir_all(&runtime).unwrap();
         let environment =
-            [("XDG_RUNTIME_DIR", &*runtime), ("TMPDIR", &*runtime), ("HOLOD_DARK_NOTES", &*folder.join("state"))];
+            [("XDG_RUNTIME_DIR", &*runtime), ("TMPDIR", &*runtime), ("HOLOD_DARK_NOTES", &*folder.join("lock"))];
         if of_service {
             let args = [&["-c", AS_SERVICE, HOLOD], &args[..]].concat();
             Daemon::start_with("/bin/sh", &args, folder, &environment)
@@ -188,7 +189,13 @@ fn what_a_person_put_out_of_a_service_stays_dark_by_hand_and_the_other_way() {
     for of_service in [false, true] {
         let laser_box = LaserBench::plug_in();
         let folder = laser_box.folder.path();
-        fs::create_dir(folder.join("state")).unwrap();
+        ["state", "lock"].iter().for_each(|name| fs::create_dir(folder.join(name)).unwrap());
+        let named = laser_box.device.display().to_string();
+        std::os::unix::fs::symlink(&named, folder.join("link")).unwrap();
+        let rig = fs::read_to_string(folder.join("rig.toml")).unwrap();
+        let by_hand = rig.replace(&named, &folder.join("link").display().to_string());
+        assert_ne!(by_hand, rig);
+        fs::write(folder.join("by-hand.toml"), by_hand).unwrap();
         let first = start(&laser_box, of_service);
         assert!(wait_until(Duration::from_secs(30), || laser_box.edges().len() > 60), "lit at first");
         let runtime = folder.join(format!("runtime-{of_service}"));
@@ -327,6 +334,14 @@ fn a_laser_box_is_looked_at_tried_out_and_put_out_by_its_port_alone() {
     assert!(status.stdout.contains("dark last because of by-hand"), "{}", status.stdout);
     let armed = laser(&["laser", "arm"]);
     assert!(armed.stdout.contains("dark by itself"), "whoever begins anew may arm it: {}", armed.stderr);
+    laser_box.faults.set_ignores_silence(true);
+    // On a busy machine the simulated box itself may stand still for its timeout.
+    let refused = (0..5).map(|_| laser(&["laser", "arm"])).find(|ended| !ended.status.success());
+    let refused = refused.expect("a box without a timeout is found");
+    assert_eq!(refused.status.code(), Some(69), "{}", refused.stderr);
+    assert!(refused.stderr.contains("do not use this box"), "{}", refused.stderr);
+    assert!(matches!(laser_box.events().last(), Some(BoxEvent::Dark { reason: DarkReason::Asked, .. })), "and put out");
+    laser_box.faults.set_ignores_silence(false);
     let none = run(HOLOD, &["laser", "status", "--port", "/dev/no-such-port"], folder);
     assert_eq!(none.status.code(), Some(69));
     assert!(none.stderr.contains("/dev/no-such-port"), "{}", none.stderr);

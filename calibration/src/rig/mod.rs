@@ -500,12 +500,12 @@ impl Rig {
     /// into the half band of this one. Of all wavelengths where there is no such laser.
     pub fn stop_colour(&self) -> Colour {
         let is_lit = |colour: &Colour| self.lasers.driver.has(*colour) && self.lasers.power_mw[*colour] > 0.0;
-        let is_longer = |one: &Colour, other: &Colour| {
+        let is_shorter = |one: &Colour, other: &Colour| {
             let [one, other] = [one, other].map(|colour| self.geometry.wavelengths[*colour].0);
-            one.total_cmp(&other)
+            other.total_cmp(&one)
         };
-        let longest_lit = Colour::ALL.into_iter().filter(is_lit).max_by(is_longer);
-        longest_lit.or(Colour::ALL.into_iter().max_by(is_longer)).unwrap_or(Colour::Red)
+        let longest_lit = Colour::ALL.into_iter().filter(is_lit).min_by(is_shorter);
+        longest_lit.or(Colour::ALL.into_iter().min_by(is_shorter)).unwrap_or(Colour::Red)
     }
 
     /// Panel pixels.

@@ -112,8 +112,10 @@ fn weights_checks(rig: &Rig, weights: &Result<Weights, Failure>) -> Vec<Check> {
     );
     let (fits, diffraction) = match weights.fit(bench) {
         BenchFit::Inside => (true, diffraction),
-        BenchFit::Near(outside) => (true, format!("{diffraction}; warning: {outside}")),
-        BenchFit::Far(outside) => (false, outside.to_string()),
+        BenchFit::Near(outside) => {
+            (true, format!("{diffraction}; warning: {}", outside.behind_relay(rig.relay_magnification)))
+        }
+        BenchFit::Far(outside) => (false, outside.behind_relay(rig.relay_magnification).to_string()),
     };
     let mut checks =
         vec![check("weights", shows_pictures, network), check("blur", true, blur), check("spread", fits, diffraction)];

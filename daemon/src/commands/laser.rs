@@ -6,8 +6,7 @@ use holod_calibration::rig::{LaserDriver, Rig};
 use holod_calibration::{Colour, TimeNs};
 use holod_pupil_input::host_now;
 use holod_slm_output::laser::{
-    BoxEvent, BoxReport, DarkReason, LaserBox, LaserError, LaserProgram, SerialBox, SerialOptions, Trigger, make_dark,
-    open_laser,
+    BoxReport, DarkReason, LaserBox, LaserError, LaserProgram, SerialBox, SerialOptions, Trigger, make_dark, open_laser,
 };
 use holod_slm_output::schedule::FieldGate;
 
@@ -159,12 +158,12 @@ fn silence(laser: &mut SerialBox, program: &LaserProgram) -> Result<Option<(Time
     let t_armed = host_now();
     let t_end = t_armed + program.heartbeat_timeout + PATIENCE;
     while host_now() < t_end {
-        // The box's own word, not what the host supposes of it.
+        // The box's own word, not what the host supposes of it. Nor is it polled: that tells a box to go dark which has
+        // gone without a heartbeat for too long, and whether it does so by itself is what is looked for.
         let state = laser.report()?.state;
         if !state.armed {
             return Ok(Some((host_now() - t_armed, state.reason)));
         }
-        laser.poll(host_now(), &mut |_: BoxEvent| {})?;
         std::thread::sleep(Duration::from_millis(2));
     }
     Ok(None)

@@ -9,6 +9,7 @@ use holod_pupil_input::{RecordFiles, ReplaySpeed, Tracker, TrackerSpec};
 use holod_slm_output::OutputSpec;
 use serde::Serialize;
 
+use super::check::access::files_of;
 use crate::aside;
 use crate::bug_report::{self, Outcome, Played};
 use crate::cli::{FitArg, RunArgs};
@@ -120,9 +121,10 @@ fn inputs(args: &RunArgs, rig: &Rig, tracker: &TrackerSpec) -> Vec<(&'static str
         WeightsChoice::File(path) => Some(("--weights", path.clone())),
         _ => None,
     };
+    let of_rig = files_of(rig).into_iter().map(|path| ("the rig", path));
     let scene = args.scene.scene.iter().flat_map(|scene| scene.split(',')).map(|path| ("--scene", path.into()));
     let tracker = tracker.files().into_iter().map(|path| ("--tracker", path));
-    config.chain(weights).chain(scene).chain(tracker).collect()
+    config.chain(weights).chain(of_rig).chain(scene).chain(tracker).collect()
 }
 
 /// Refuses what `run` would by its options and its rig alone. Devices are not opened; files that are not there may be

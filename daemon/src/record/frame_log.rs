@@ -63,6 +63,8 @@ pub(crate) struct FrameLog {
     frames: HashMap<u64, FrameRecord>,
     /// The frame of the last row.
     newest: Option<u64>,
+    /// Its path leads elsewhere.
+    is_moved: bool,
 }
 
 /// A file that takes nothing more once it has refused something: csv's writer keeps what was refused, of which the
@@ -118,7 +120,7 @@ impl FrameLog {
 
     fn of(file: File, path: PathBuf) -> Self {
         let rows = csv::Writer::from_writer(UntilRefused { file, has_refused: false });
-        Self { rows, path, frames: HashMap::new(), newest: None }
+        Self { rows, path, frames: HashMap::new(), newest: None, is_moved: false }
     }
 
     /// Takes note of a rendered frame; its rows are written when its fields are shown.
@@ -162,12 +164,31 @@ impl FrameLog {
     /// The disk's, with the file's name.
     pub(crate) fn flush(&mut self) -> Result<(), Failure> {
         let metadata = self.rows.flush().and_then(|()| self.rows.get_ref().file.metadata());
-        match metadata.map(|metadata| metadata.nlink()) {
-            // What is written into a file without a name is lost when it is closed.
-            Ok(0) => Err(self.lost(&io::Error::new(io::ErrorKind::NotFound, "the file was deleted"))),
-            Ok(_) => Ok(()),
-            Err(error) => Err(self.lost(&error)),
+        let metadata = metadata.map_err(|error| self.lost(&error))?;
+        // What is written into a file without a name is lost when it is closed.
+        if metadata.nlink() == 0 {
+            return Err(self.lost(&io::Error::new(io::ErrorKind::NotFound, "the file was deleted")));
         }
+        self.look_for(&metadata);
+        Ok(())
+    }
+
+    /// Says once that the folder was moved: rows go on in it, but what is written by its path is missing at the end.
+    fn look_for(&mut self, written: &fs::Metadata) {
+        let is_moved = match fs::metadata(&self.path) {
+            Ok(found) => (found.dev(), found.ino()) != (written.dev(), written.ino()),
+            Err(error) => error.kind() == io::ErrorKind::NotFound,
+        };
+        let path = self.path.display();
+        match (self.is_moved, is_moved) {
+            (false, true) => tracing::warn!(
+                "{path} is not where this run records any more: rows go on in the folder that was moved, but orders and \
+                 the summary will be missing in it; move it back, and leave a record where it is until its run is over"
+            ),
+            (true, false) => tracing::info!("{path} is back"),
+            _ => {}
+        }
+        self.is_moved = is_moved;
     }
 
     /// Whether no frame was ever made.
@@ -319,6 +340,28 @@ mod tests {
         let failure = log.flush().unwrap_err();
         assert_eq!(failure.exit, Exit::CannotCreate);
         assert!(failure.to_string().contains("frames.csv: the file was deleted"), "{failure}");
+    }
+
+    #[test]
+    fn a_record_that_is_moved_goes_on_and_is_noticed_until_it_is_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let [record, elsewhere] = ["record", "elsewhere"].map(|name| folder.path().join(name));
+        let mut log = FrameLog::create(&record).unwrap();
+        let is_moved = |log: &mut FrameLog| {
+            log.flush().unwrap();
+            log.is_moved
+        };
+        assert!(!is_moved(&mut log));
+        fs::rename(&record, &elsewhere).unwrap();
+        assert!(is_moved(&mut log));
+        fs::create_dir(&record).unwrap();
+        fs::write(record.join(FRAMES), "another").unwrap();
+        assert!(is_moved(&mut log));
+        fs::remove_dir_all(&record).unwrap();
+        fs::rename(&elsewhere, &record).unwrap();
+        log.field(&field(7)).unwrap();
+        assert!(!is_moved(&mut log));
+        assert_eq!(fs::read_to_string(record.join(FRAMES)).unwrap().lines().count(), 2);
     }
 
     #[test]

@@ -25,7 +25,7 @@ const BUSY: &str = "the frame loop has not taken the last change yet: ask again"
 
 /// Of a note that lies in the runtime folder alone.
 const UNSEEN: &str = "; the service, or a run of another user, does not see that, because no note can be left in a folder \
-                      that they share: `systemctl stop holod`, or a user who can write to /run/lock, keeps them dark there";
+                      that they share: end the service by `systemctl stop holod`, and ask other users to light none";
 
 impl Watch<'_> {
     /// Obeys what has been asked for; whether that is to end.

@@ -222,8 +222,9 @@ impl Scene {
         Ok((frame, report))
     }
 
-    /// Loads frame `index` as [`Self::load`] does, with depths that are not clamped to any range. What the picture does
-    /// not reach is black, at the far end of `geometry`.
+    /// Loads frame `index` as [`Self::load`] does, with depths that are not clamped to any display's range: what lies
+    /// beyond infinity, as normalised depths below 0 may, is at infinity. What the picture does not reach is black, at
+    /// the far end of `geometry`.
     pub fn picture(
         &self,
         index: usize,
@@ -231,8 +232,11 @@ impl Scene {
         resolution: Option<Resolution>,
         fit: Fit,
     ) -> Result<ScenePicture, SceneError> {
-        let ScenePicture { resolution: size, linear, depth_dpt, mut report } = self.read(index, fit)?;
+        let ScenePicture { resolution: size, linear, mut depth_dpt, mut report } = self.read(index, fit)?;
         let (placement, resolution) = self.placement(index, size, resolution, fit)?;
+        for dioptres in &mut depth_dpt {
+            *dioptres = dioptres.max(0.0);
+        }
         report.padded_px = placement.padded_px();
         let Dioptres(far_dpt) = geometry.depth_far;
         // Never nearer than that by rounding, so that it becomes the end itself.

@@ -223,6 +223,19 @@ fn depths_beyond_the_display_are_clamped_and_counted() {
 }
 
 #[test]
+fn a_picture_that_is_not_clamped_to_a_display_ends_at_infinity() {
+    let files = Files::new();
+    let normalised = [-1e-3, 0.0, 0.5, 1.25];
+    files.exr("both.exr", size(4, 1), [0, 0], size(4, 1), |channel, index| match channel {
+        "Z" => normalised[index],
+        _ => 0.5,
+    });
+    let encoding = DepthEncoding::NormalisedDioptres { far_dpt: 0.0, near_dpt: 4.0 };
+    let scene = Scene::open(&files.path("both.exr").display().to_string(), Some(encoding)).unwrap();
+    assert_eq!(scene.picture(0, &BENCH, None, Fit::Native).unwrap().depth_dpt, [0.0, 0.0, 2.0, 5.0]);
+}
+
+#[test]
 fn sizes_are_fitted_only_as_asked() {
     let files = Files::new();
     files.colour8("c.png", 8, 4, |_, _| [255; 3]);

@@ -135,10 +135,11 @@ pub(crate) struct RawLog {
 }
 
 impl RawLog {
-    /// Whether the file is such a recording.
+    /// Whether it is a file, and such a recording.
     pub(crate) fn recognises(path: &Path) -> bool {
         let mut begin = [0; MAGIC.len()];
-        File::open(path).and_then(|mut file| file.read_exact(&mut begin)).is_ok() && begin == MAGIC
+        // To open a pipe is to wait for whoever writes into it.
+        path.is_file() && File::open(path).and_then(|mut file| file.read_exact(&mut begin)).is_ok() && begin == MAGIC
     }
 
     /// Reads all of it once, to find its end and what is missing.

@@ -403,7 +403,11 @@ impl Camera {
 
     /// The greatest error from `after_s` on, ms.
     fn worst_ms(&self, after_s: i64) -> i64 {
-        let later = self.sent.iter().zip(&self.errors).filter(|(sample, _)| sample.taken - BEGINS >= after_s * S);
+        self.worst_ms_from(after_s * S)
+    }
+
+    fn worst_ms_from(&self, since: i64) -> i64 {
+        let later = self.sent.iter().zip(&self.errors).filter(|(sample, _)| sample.taken - BEGINS >= since);
         later.map(|(_, error)| error.abs()).max().expect("some") / MS
     }
 }
@@ -439,6 +443,22 @@ fn a_clock_that_is_set_is_found_beside_its_readings() {
             let camera = Camera::new(|_| delay_ms, |since| if since < 10 * S { since } else { since + by });
             assert_eq!(camera.model.resets(), 1, "{by} with {delay_ms} ms");
             assert!(camera.worst_ms(12) <= 3, "{by} with {delay_ms} ms: {} ms", camera.worst_ms(12));
+        }
+    }
+}
+
+/// Whenever readings fall between the samples that tell it: one that is off the line itself is no proof that the clock
+/// goes on.
+#[test]
+fn a_clock_that_is_set_back_a_little_is_found_at_once_beside_its_readings() {
+    for by_ms in [-125, -140] {
+        for phase_ms in (0..250).step_by(10) {
+            let set = 10 * S + phase_ms * MS;
+            let camera = Camera::new(|_| 100, |since| if since < set { since } else { since + by_ms * MS });
+            assert_eq!(camera.model.resets(), 1, "{by_ms} ms at {phase_ms} ms");
+            // After the next two readings.
+            let late_ms = camera.worst_ms_from(set + 500 * MS);
+            assert!(late_ms <= 5, "{by_ms} ms at {phase_ms} ms: {late_ms} ms");
         }
     }
 }

@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use holod_calibration::TimeNs;
 use holod_laser_firmware::command::SIMULATED;
-use holod_laser_firmware::{Controller, Event, Hardware, Laser, Limits, TimeUs};
+use holod_laser_firmware::{Command, Controller, Event, Hardware, Laser, Limits, Line, TimeUs};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
@@ -63,6 +63,7 @@ pub struct Faults {
     corrupt_in: AtomicBool,
     corrupt_out: AtomicBool,
     cut: AtomicBool,
+    ignores_silence: AtomicBool,
     sync_period_ns: AtomicU64,
     sync_begin_ns: AtomicI64,
     resets: AtomicU64,
@@ -78,6 +79,7 @@ impl Default for Faults {
             corrupt_in: AtomicBool::new(false),
             corrupt_out: AtomicBool::new(false),
             cut: AtomicBool::new(false),
+            ignores_silence: AtomicBool::new(false),
             sync_period_ns: AtomicU64::new(0),
             sync_begin_ns: AtomicI64::new(0),
             resets: AtomicU64::new(0),
@@ -110,6 +112,11 @@ impl Faults {
     /// Pulls the cable, or plugs it in again: what is sent is lost in both directions, and neither end hears of it.
     pub fn set_cut(&self, cut: bool) {
         self.cut.store(cut, Ordering::Relaxed);
+    }
+
+    /// Lets the firmware take silence for heartbeats, as one without a timeout would.
+    pub fn set_ignores_silence(&self, ignores_silence: bool) {
+        self.ignores_silence.store(ignores_silence, Ordering::Relaxed);
     }
 
     /// Resets the box, as its watchdog or a dip of its supply would.
@@ -198,6 +205,7 @@ impl SimulatedBox {
             sees_hang_up: self.sees_hang_up,
             hung_up: false,
             idle: false,
+            in_line: false,
             last_edge: None,
         };
         Controller::new(board, self.name, self.limits)
@@ -214,6 +222,8 @@ struct Board<'a, R, W> {
     sees_hang_up: bool,
     hung_up: bool,
     idle: bool,
+    /// A line has begun and not ended.
+    in_line: bool,
     /// Host time of the last sync edge that was handed out.
     last_edge: Option<i64>,
 }
@@ -260,11 +270,13 @@ impl<R: Read, W: Write> Hardware for Board<'_, R, W> {
                 if self.faults.corrupt_in.swap(false, Ordering::Relaxed) {
                     bytes[0] ^= 4;
                 }
+                self.in_line = bytes[count - 1] != b'\n';
                 count
             }
             Err(ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
                 self.hung_up = false;
-                0
+                let beats = self.faults.ignores_silence.load(Ordering::Relaxed) && !self.in_line;
+                if beats { heartbeat_in(bytes) } else { 0 }
             }
             Err(_) => {
                 self.hung_up = true;
@@ -289,6 +301,14 @@ impl<R: Read, W: Write> Hardware for Board<'_, R, W> {
     fn set_power(&mut self, _power_uw: [u32; 3]) {}
 
     fn feed_watchdog(&mut self) {}
+}
+
+/// A heartbeat that no host has sent, where there is room for one. Its answer is to no command of a host's.
+fn heartbeat_in(bytes: &mut [u8]) -> usize {
+    let line = Line::new(format_args!("0 {}", Command::Heartbeat.word())).expect("it fits into a line");
+    let Some(room) = bytes.get_mut(..line.as_bytes().len()) else { return 0 };
+    room.copy_from_slice(line.as_bytes());
+    room.len()
 }
 
 /// One turn of the firmware's loop; false once the line has hung up and the box is dark.

@@ -25,6 +25,8 @@ const PERIOD_GAIN: f64 = 0.02;
 const BIAS_GAIN: f64 = 0.05;
 /// Share of a new interval in the rate that is shown to people.
 const RATE_GAIN: f64 = 0.05;
+/// Intervals in a row of as many periods each, of which the panel itself makes one: reports are missed at random.
+const SLOWER_IN_A_ROW: u32 = 30;
 
 /// Compares each report with the ones before it.
 ///
@@ -48,6 +50,14 @@ pub(super) struct RefreshJudge {
     strays: u32,
     t_before: Option<TimeNs>,
     shown_period_ns: Option<f64>,
+    alike: Alike,
+}
+
+/// The last intervals between reports that had as many periods of the rate that is shown as each other.
+#[derive(Clone, Copy, Debug, Default)]
+struct Alike {
+    periods: f64,
+    in_a_row: u32,
 }
 
 /// The newest report that fits, at the time that the rhythm gives it.
@@ -87,6 +97,7 @@ impl RefreshJudge {
             strays: 0,
             t_before: None,
             shown_period_ns: None,
+            alike: Alike::default(),
         }
     }
 
@@ -191,7 +202,13 @@ impl RefreshJudge {
         if let Some(t_before) = self.t_before.replace(t) {
             let interval_ns = (t.0 - t_before.0) as f64;
             let periods = (interval_ns / self.shown_period_ns.unwrap_or(self.nominal_ns)).round().max(1.0);
-            let period_ns = interval_ns / periods;
+            let in_a_row = if periods == self.alike.periods { self.alike.in_a_row + 1 } else { 1 };
+            self.alike = Alike { periods, in_a_row };
+            let runs_slower = periods > 1.0 && in_a_row >= SLOWER_IN_A_ROW;
+            if runs_slower {
+                self.shown_period_ns = None;
+            }
+            let period_ns = if runs_slower { interval_ns } else { interval_ns / periods };
             if period_ns > 0.1 * self.nominal_ns && period_ns < 10.0 * self.nominal_ns {
                 let shown_ns = self.shown_period_ns.get_or_insert(period_ns);
                 *shown_ns += RATE_GAIN * (period_ns - *shown_ns);
@@ -377,5 +394,22 @@ mod tests {
             let _believed = judge.judge(&report(count * 20_000_000, None));
         }
         assert!((judge.refresh_hz() - 50.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_panel_at_a_part_of_its_rate_is_told_from_one_whose_reports_are_missed() {
+        let refresh_hz = |every: &dyn Fn(i64) -> bool| {
+            let mut judge = judge();
+            for count in (1..400).filter(|&count| every(count)) {
+                let _believed = judge.judge(&report(count * PERIOD, None));
+            }
+            judge.refresh_hz()
+        };
+        assert!((refresh_hz(&|count| count % 2 == 0) - 30.0).abs() < 1e-3);
+        assert!((refresh_hz(&|count| count % 3 == 0) - 20.0).abs() < 1e-3);
+        // Of each nine in a row three are missed, so that whole runs of intervals have two periods.
+        assert!((refresh_hz(&|count| ![1, 3, 5].contains(&(count % 9))) - 60.0).abs() < 1e-3);
+        // At its own rate again.
+        assert!(refresh_hz(&|count| count > 100 || count % 2 == 0) > 59.9);
     }
 }

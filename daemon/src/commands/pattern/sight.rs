@@ -88,7 +88,9 @@ impl Sight {
                         CAMERA_DPT.end()
                     )
                 };
-                notes.push(format!("the focus is {:.2} mm {side} the panel's image: {seen}", 1e3 * f_m.abs()));
+                // Depth grows by the square of a relay's magnification.
+                let from_image_mm = 1e3 * f_m.abs() * rig.relay_magnification.powi(2);
+                notes.push(format!("the focus is {from_image_mm:.2} mm {side} the panel's image: {seen}"));
             }
             Pattern::Dots { spacing_px, .. } => {
                 let spacing_mrad = spacing_px as f64 * optics.pixel_angle_rad() * 1e3;
@@ -238,7 +240,10 @@ impl fmt::Display for Sight {
             writeln!(f, "written: {}", file.display())?;
         }
         if !self.spots.is_empty() {
-            writeln!(f, "in the eyepiece's focal plane, from the axis, x to the viewer's right and y up:")?;
+            writeln!(
+                f,
+                "in the eyepiece's focal plane, from the axis, x to the viewer's right and y up; angles as light leaves the panel:"
+            )?;
             writeln!(f, "  laser   order   light      angle         x          y")?;
         }
         for spot in &self.spots {
