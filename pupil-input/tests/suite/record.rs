@@ -197,6 +197,7 @@ fn a_recording_is_played_with_the_scale_of_its_run() {
         eventually("the end", || handle.control.finished());
         handle.control.stop();
         assert!(handle.control.remarks()[0].contains(told), "{:?}", handle.control.remarks());
+        assert_eq!(handle.control.figures().recorded_scale, Some(0.5), "so that a refusal tells the figures that came");
         assert_eq!(fs::read_to_string(&again).expect("reads") == samples, scale.is_none());
         fs::remove_file(again).expect("removes");
     }
