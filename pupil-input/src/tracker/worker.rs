@@ -21,7 +21,7 @@ use crate::profile::Profile;
 use crate::record::{Kind, ROOM, Taps};
 use crate::sequence::{SequenceEvent, SequenceTracker};
 use crate::simulate::{MockSource, Script};
-use crate::source::{ByteSource, Feed, ReadEvent};
+use crate::source::{ByteSource, Feed, LONGEST_READ, ReadEvent};
 use crate::spec::ReplaySpeed;
 use crate::stamp::Stamper;
 use crate::wire::{Decoder, WireEvent};
@@ -36,8 +36,6 @@ const LONGEST_BACK_OFF: Duration = Duration::from_secs(2);
 const LONG_WAIT: TimeNs = TimeNs(10_000_000_000);
 /// Whoever reads decisions, and has taken none for this long, reads none.
 const UNREAD: TimeNs = TimeNs(1_000_000_000);
-/// The longest datagram there is.
-const BUFFER_BYTES: usize = 1 << 16;
 
 /// The thread's own state. While a link lasts nothing is allocated after its first sample.
 pub(super) struct Worker {
@@ -75,7 +73,7 @@ impl Worker {
         let mut link = Some(open);
         let datagrams = feed.datagrams();
         let mut stream = LiveStream::new(profile, datagrams);
-        let mut buffer = vec![0; BUFFER_BYTES];
+        let mut buffer = vec![0; LONGEST_READ];
         let mut back_off = FIRST_BACK_OFF;
         // What the feed said last.
         let mut is_troubled = false;
