@@ -78,8 +78,9 @@ impl Worker {
         // What the feed said last.
         let mut is_troubled = false;
         let mut silent_from = host_now() + FIRST_SILENCE;
-        self.connected(host_now());
-        self.estimator.begin(host_now());
+        let opened = host_now();
+        self.connected(opened);
+        self.estimator.begin(opened);
         while self.goes_on() {
             let Some(open) = &mut link else {
                 if !self.wait_until(host_now() + TimeNs(back_off.as_nanos() as i64)) {
@@ -169,7 +170,7 @@ impl Worker {
         if let ReplaySpeed::Times(rate) = speed {
             self.clock = StreamClock { host: origin, stream: raw.begins(), rate };
         }
-        let mut later = TimeNs(0);
+        let (mut later, mut begun) = (TimeNs(0), false);
         loop {
             let mut stream = LiveStream::new(raw.profile(), raw.datagrams());
             // It was read to its end when the tracker was started. What cannot be read any more is its end now.
@@ -194,6 +195,10 @@ impl Worker {
                     Kind::Connected => {
                         stream.rejoin(raw.profile());
                         self.connected(arrival);
+                        // As live, where the link was opened for the first time.
+                        if !std::mem::replace(&mut begun, true) {
+                            self.estimator.begin(arrival);
+                        }
                     }
                     Kind::Bytes => {
                         stream.push(payload, arrival, self);
