@@ -262,6 +262,7 @@ mod tests {
             assert_eq!(reason.index(), index);
         }
     }
+
     #[test]
     fn numbers_that_are_overtaken_are_taken_from_the_missing_ones() {
         let counters = Counters::new();

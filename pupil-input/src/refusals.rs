@@ -76,7 +76,7 @@ pub enum RefusalChange {
 /// Follows a tracker's decisions and counts, and finds out when everything is refused. Pure: it reads no clock.
 #[derive(Clone, Debug)]
 pub struct RefusalWatch {
-    scale: f64,
+    scale: Scale,
     figures: Figures,
     eye: rig::Eye,
     limits: GateSettings,
@@ -90,6 +90,26 @@ pub struct RefusalWatch {
     refused_since: Option<TimeNs>,
     unread: Unread,
     current: Option<Refusal>,
+}
+
+/// Millimetres for one of a tracker's figures.
+#[derive(Clone, Copy, Debug)]
+struct Scale {
+    factor: f64,
+    /// It is that of a recording, and no settings name another.
+    is_recorded: bool,
+}
+
+impl Scale {
+    fn of(settings: &rig::Tracker, figures: Figures) -> Self {
+        let is_recorded = settings.scale.is_none() && figures.recorded_scale.is_some();
+        Self { factor: figures.scale(settings).unwrap_or(1.0), is_recorded }
+    }
+
+    /// Where it is written.
+    const fn place(self) -> &'static str {
+        if self.is_recorded { "of the recording" } else { "in the rig file" }
+    }
 }
 
 /// Bytes without a sample in them.
@@ -121,7 +141,7 @@ impl RefusalWatch {
     /// A watch over a tracker of such figures that was started with `settings` at host time `began`.
     pub fn new(settings: &rig::Tracker, figures: Figures, began: TimeNs) -> Self {
         Self {
-            scale: settings.scale.unwrap_or(1.0),
+            scale: Scale::of(settings, figures),
             figures,
             eye: settings.eye,
             limits: GateSettings::default(),
@@ -137,7 +157,7 @@ impl RefusalWatch {
 
     /// The tracker goes on with other settings, at these counts: what was refused before says nothing of them.
     pub fn change(&mut self, settings: &rig::Tracker, counts: &CounterSnapshot) {
-        (self.scale, self.eye) = (settings.scale.unwrap_or(1.0), settings.eye);
+        (self.scale, self.eye) = (Scale::of(settings, self.figures), settings.eye);
         self.samples.clear();
         self.believed = Some(*counts);
         self.proven = false;
@@ -316,7 +336,7 @@ impl RefusalWatch {
         let Some(mm) = median(figures.map(|sample| f64::from(sample.diameter_mm))) else {
             return "the figures are no diameters of a pupil".into();
         };
-        let figure = mm / self.scale;
+        let figure = mm / self.scale.factor;
         let shown = significant(figure);
         let (least_mm, greatest_mm) = (self.limits.least_mm, self.limits.greatest_mm);
         if self.proven {
@@ -332,13 +352,13 @@ impl RefusalWatch {
         if figure == 0.0 {
             return "the tracker sends 0: does it see the pupil?".into();
         }
-        let Figures { unit, mm_per_unit } = self.figures;
+        let Figures { unit, mm_per_unit, .. } = self.figures;
         if mm_per_unit != 1.0 {
             return self.profile_advice(figure / mm_per_unit, mm);
         }
         // Any figure may be a right one.
         if unit != SizeUnit::Millimetres {
-            let made = match self.scale {
+            let made = match self.scale.factor {
                 1.0 => String::new(),
                 scale => format!(", nor are {} mm, which scale_mm_per_unit = {scale} makes of it", significant(mm)),
             };
@@ -347,16 +367,21 @@ impl RefusalWatch {
                 unit.name()
             );
         }
-        if self.scale != 1.0 && LIKELY_MM.contains(&figure) {
+        if self.scale.factor != 1.0 && LIKELY_MM.contains(&figure) {
+            let (of_recording, cure) = if self.scale.is_recorded {
+                (" of the recording", "set scale_mm_per_unit = 1 in the rig file")
+            } else {
+                ("", "take that key out of the rig file")
+            };
             return format!(
-                "{shown}: looks like millimetres, which scale_mm_per_unit = {} makes {} mm; take that key out of the rig \
-                 file, or give --scale 1",
-                self.scale,
+                "{shown}: looks like millimetres, which scale_mm_per_unit = {}{of_recording} makes {} mm; {cure}, or give \
+                 --scale 1",
+                self.scale.factor,
                 significant(mm)
             );
         }
         // The figure as it came, or, where a scale that was measured has slipped, after the scale.
-        let slips = [1.0, self.scale].map(|scale| MISTAKEN_UNITS.map(|(unit, factor)| (unit, scale * factor)));
+        let slips = [1.0, self.scale.factor].map(|scale| MISTAKEN_UNITS.map(|(unit, factor)| (unit, scale * factor)));
         if let Some((unit, scale)) = slips.concat().into_iter().find(|(_, scale)| LIKELY_MM.contains(&(figure * scale)))
         {
             let else_ = match unit {
@@ -385,9 +410,9 @@ impl RefusalWatch {
                 significant(raw * factor)
             );
         }
-        let scaled = match self.scale {
+        let scaled = match self.scale.factor {
             1.0 => String::new(),
-            scale => format!(" and scale_mm_per_unit = {scale} in the rig file"),
+            scale => format!(" and scale_mm_per_unit = {scale} {}", self.scale.place()),
         };
         format!(
             "{shown}: mm_per_unit = {factor} in the profile's [size]{scaled} makes {} mm of it, which is no pupil's ({} to \
@@ -531,7 +556,7 @@ mod tests {
     use crate::estimator::{Estimator, EstimatorSettings};
 
     const MS: i64 = 1_000_000;
-    const MILLIMETRES: Figures = Figures { unit: SizeUnit::Millimetres, mm_per_unit: 1.0 };
+    const MILLIMETRES: Figures = Figures { unit: SizeUnit::Millimetres, mm_per_unit: 1.0, recorded_scale: None };
 
     fn settings() -> rig::Tracker {
         rig::Rig::default().tracker
@@ -565,7 +590,7 @@ mod tests {
         of: impl Fn(i64) -> PupilSample,
     ) -> Vec<(TimeNs, RefusalChange)> {
         let counters = Counters::new();
-        let mut estimator = Estimator::new(EstimatorSettings::from(settings));
+        let mut estimator = Estimator::new(EstimatorSettings::from(&figures.scaled(settings)));
         let mut watch = RefusalWatch::new(settings, figures, TimeNs(0));
         let mut told = Vec::new();
         for k in 0..count {
@@ -653,8 +678,8 @@ mod tests {
 
     #[test]
     fn no_unit_of_length_is_guessed_of_what_is_none() {
-        let arbitrary = Figures { unit: SizeUnit::Arbitrary, mm_per_unit: 1.0 };
-        let known = Figures { unit: SizeUnit::Millimetres, mm_per_unit: 0.05 };
+        let arbitrary = Figures { unit: SizeUnit::Arbitrary, ..MILLIMETRES };
+        let known = Figures { mm_per_unit: 0.05, ..MILLIMETRES };
         let cases = [
             (arbitrary, 3303.0, 1.0, "3303 in arbitrary units: no pupil's millimetres (1 to 9); measure an artificial"),
             (arbitrary, 3303.0, 0.01, "nor are 33.03 mm, which scale_mm_per_unit = 0.01 makes of it; measure"),
@@ -673,6 +698,43 @@ mod tests {
             let said = advice_of(&settings, figures, |k| PupilSample { diameter_mm: figure, ..sample(k) });
             assert!(said.contains(expected) && !said.contains("metres;"), "{said}");
         }
+    }
+
+    #[test]
+    fn the_scale_of_a_recording_is_taken_out_of_the_figures_that_are_told() {
+        let pixels = Figures { unit: SizeUnit::Pixels, mm_per_unit: 1.0, recorded_scale: Some(0.05) };
+        let cases = [
+            (pixels, 300.0, None, "300 in camera pixels: no pupil's millimetres (1 to 9), nor are 15 mm, which"),
+            (pixels, 300.0, Some(0.1), "300 in camera pixels: no pupil's millimetres (1 to 9), nor are 30 mm, which"),
+            (
+                Figures { unit: SizeUnit::Millimetres, ..pixels },
+                3.5,
+                None,
+                "3.5: looks like millimetres, which scale_mm_per_unit = 0.05 of the recording makes 0.175 mm; set \
+                 scale_mm_per_unit = 1 in the rig file, or give --scale 1",
+            ),
+            (
+                Figures { mm_per_unit: 2.0, ..pixels },
+                300.0,
+                None,
+                "[size] and scale_mm_per_unit = 0.05 of the recording",
+            ),
+        ];
+        for (figures, figure, scale, expected) in cases {
+            let settings = rig::Tracker { scale, ..settings() };
+            let said = advice_of(&settings, figures, |k| PupilSample { diameter_mm: figure, ..sample(k) });
+            assert!(said.contains(expected), "{said}");
+        }
+        // Other settings, which name no scale either.
+        let mut watch = RefusalWatch::new(&rig::Tracker { scale: Some(0.1), ..settings() }, pixels, TimeNs(0));
+        watch.change(&settings(), &CounterSnapshot::zero());
+        let counters = Counters::new();
+        counters.add_rejected(Rejection::OutOfRange);
+        let sample = PupilSample { diameter_mm: 15.0, ..sample(0) };
+        watch.note(&Decision { sample, verdict: Verdict::Rejected(Rejection::OutOfRange) });
+        let said = watch.judge(TimeNs(0), &counters.snapshot(), true);
+        let Some(RefusalChange::Refused(refusal)) = said else { panic!("{said:?}") };
+        assert!(refusal.advice.starts_with("300 in camera pixels"), "{refusal}");
     }
 
     #[test]

@@ -5,11 +5,12 @@ use crate::SampleEye;
 /// What a sequence of running numbers says about lost lines.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct SequenceTracker {
-    last: Option<(u64, SampleEye)>,
-    /// Numbers before the last one that have not come: bit 0 is the one right before it.
+    /// The newest number.
+    last: Option<u64>,
+    /// The numbers that have come of each eye: bit 0 is the newest one, bit 1 the one right before it.
+    came: [u128; 3],
+    /// The numbers before it that have not come, of any eye.
     missing: u128,
-    /// The number that came late last, with its eye.
-    late: Option<(u64, SampleEye)>,
     /// The newest of the numbers that came again and rose since the last new one, and how many they are.
     again: Option<(u64, u32)>,
 }
@@ -17,7 +18,7 @@ pub(crate) struct SequenceTracker {
 /// What one running number tells after those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SequenceEvent {
-    /// The next one, the first one, or the other eye of the same instant.
+    /// The next one, the first one, or the other eye of an instant.
     InOrder,
     /// This many numbers are missing.
     Gap(u64),
@@ -26,7 +27,7 @@ pub(crate) enum SequenceEvent {
         /// By how much the gaps that there are have grown; a gap is filled, cut short or parted.
         gaps: i8,
     },
-    /// A number that has come before, as of a datagram that a network has doubled.
+    /// A number that has come before with its eye, as of a datagram that a network has doubled.
     Repeat,
     /// The count went backwards: the tracker restarted or its counter wrapped.
     Restart,
@@ -43,50 +44,56 @@ const LONGEST_GAP: u64 = 3_600_000;
 impl SequenceTracker {
     /// A tracker that has seen no number.
     pub(crate) const fn new() -> Self {
-        Self { last: None, missing: 0, late: None, again: None }
+        Self { last: None, came: [0; 3], missing: 0, again: None }
+    }
+
+    /// One that has seen this alone.
+    fn beginning_with(sequence: u64, eye: SampleEye) -> Self {
+        let mut begun = Self { last: Some(sequence), ..Self::new() };
+        begun.came[eye.index()] = 1;
+        begun
     }
 
     /// Takes the next sample's number.
     pub(crate) fn next(&mut self, sequence: u64, eye: SampleEye) -> SequenceEvent {
-        let Some((last, last_eye)) = self.last else {
-            self.last = Some((sequence, eye));
+        let Some(last) = self.last else {
+            *self = Self::beginning_with(sequence, eye);
             return SequenceEvent::InOrder;
         };
         if let Some(back @ 0..=REMEMBERED) = last.checked_sub(sequence) {
-            if back == 0 && eye != last_eye {
-                self.last = Some((sequence, eye));
-                return SequenceEvent::InOrder;
-            }
             return self.not_new(sequence, eye, back);
         }
-        self.last = Some((sequence, eye));
-        self.again = None;
         match sequence.checked_sub(last) {
             Some(step @ 1..=LONGEST_GAP) => {
-                let passed = u32::try_from(step).ok();
-                let shifted = |bits: u128| passed.and_then(|step| bits.checked_shl(step)).unwrap_or(0);
-                // All between the two, and nothing at the place of the former last one.
-                let between = shifted(1).wrapping_sub(1) >> 1;
+                let shifted = |bits: u128| bits.checked_shl(step as u32).unwrap_or(0);
+                // All between the two: neither the new one nor the former newest.
+                let between = shifted(1).wrapping_sub(1) & !1;
                 self.missing = shifted(self.missing) | between;
+                self.came = self.came.map(shifted);
+                self.came[eye.index()] |= 1;
+                (self.last, self.again) = (Some(sequence), None);
                 if step == 1 { SequenceEvent::InOrder } else { SequenceEvent::Gap(step - 1) }
             }
             _ => {
-                (self.missing, self.late) = (0, None);
+                *self = Self::beginning_with(sequence, eye);
                 SequenceEvent::Restart
             }
         }
     }
 
-    /// A number `back` before the last one: one that was missing, or one that comes again.
+    /// A number `back` before the newest one: one that was missing, the other eye of one, or one that comes again.
     fn not_new(&mut self, sequence: u64, eye: SampleEye, back: u64) -> SequenceEvent {
-        if self.late.is_some_and(|(number, other)| number == sequence && other != eye) {
-            return SequenceEvent::InOrder;
-        }
-        let is_missing = |place: u64| self.missing >> place & 1 == 1;
-        if let Some(place) = back.checked_sub(1).filter(|place| is_missing(*place)) {
-            let beside = i8::from(place > 0 && is_missing(place - 1)) + i8::from(is_missing(place + 1));
-            self.missing &= !(1 << place);
-            self.late = Some((sequence, eye));
+        let has = |bits: u128, back: u64| bits.checked_shr(back as u32).is_some_and(|bits| bits & 1 == 1);
+        let is_missing = |back: u64| has(self.missing, back);
+        let came = self.came.map(|bits| has(bits, back));
+        let is_of_other_eye = came.contains(&true) && !came[eye.index()];
+        if is_of_other_eye || is_missing(back) {
+            let beside = i8::from(is_missing(back.saturating_sub(1))) + i8::from(is_missing(back + 1));
+            self.missing &= !(1 << back);
+            self.came[eye.index()] |= 1 << back;
+            if is_of_other_eye {
+                return SequenceEvent::InOrder;
+            }
             return SequenceEvent::Overtaken { gaps: beside - 1 };
         }
         let rises = match self.again {
@@ -98,7 +105,7 @@ impl SequenceTracker {
             self.again = Some((sequence, rises));
             return SequenceEvent::Repeat;
         }
-        *self = Self { last: Some((sequence, eye)), ..Self::new() };
+        *self = Self::beginning_with(sequence, eye);
         SequenceEvent::Restart
     }
 }
@@ -121,6 +128,32 @@ mod tests {
         assert_eq!(next(3, SampleEye::Left), SequenceEvent::Gap(2));
         assert_eq!(next(9_000_000, SampleEye::Left), SequenceEvent::Restart);
         assert_eq!(next(1, SampleEye::Left), SequenceEvent::Restart);
+    }
+
+    #[test]
+    fn the_other_eye_of_a_number_is_no_repeat_however_late() {
+        use SampleEye::{Left, Right};
+        use SequenceEvent::{Gap, InOrder, Overtaken, Repeat};
+        let cases = [
+            (1, Left, InOrder),
+            (2, Left, InOrder),
+            (1, Right, InOrder),
+            (2, Right, InOrder),
+            (1, Right, Repeat),
+            (2, Left, Repeat),
+            (5, Left, Gap(2)),
+            (2, Right, Repeat),
+            (4, Right, Overtaken { gaps: 0 }),
+            (3, Right, Overtaken { gaps: -1 }),
+            (4, Left, InOrder),
+            (3, Left, InOrder),
+            (5, Right, InOrder),
+            (4, Right, Repeat),
+        ];
+        let mut tracker = SequenceTracker::default();
+        for (number, eye, expected) in cases {
+            assert_eq!(tracker.next(number, eye), expected, "{number} {eye:?}");
+        }
     }
 
     /// Gaps, numbers missing and restarts after `numbers`.

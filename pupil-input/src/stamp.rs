@@ -3,12 +3,13 @@
 
 use holod_calibration::TimeNs;
 
+use crate::PupilSample;
 use crate::clock::{ClockModel, ClockReport};
+use crate::source::LONGEST_READ;
 use crate::wire::WireSample;
-use crate::{PupilSample, SampleEye};
 
-/// Samples without a time that one read may bring and still be spread; those beyond are stamped with the arrival.
-const BATCH: usize = 256;
+/// Room for the samples without a time that one read may bring: none is shorter than a byte.
+const BATCH: usize = LONGEST_READ;
 /// Intervals that are believed between samples of one eye: 10 kHz to 10 Hz.
 const LEAST_INTERVAL: TimeNs = TimeNs(100_000);
 const GREATEST_INTERVAL: TimeNs = TimeNs(100_000_000);
@@ -58,33 +59,29 @@ impl Stamper {
     pub(crate) fn take(&mut self, wire: WireSample, arrival: TimeNs) -> Option<PupilSample> {
         match wire.t_device {
             Some(t_device) => Some(stamped(&wire, t_device, self.clock.map(t_device, arrival), arrival)),
-            None if self.batch.len() < BATCH => {
+            None => {
                 self.batch.push(wire);
                 None
             }
-            None => Some(stamped(&wire, arrival, arrival, arrival)),
         }
     }
 
     /// Ends the bytes that were read at `arrival`: each eye's samples that have no time lie one usual interval apart,
     /// the newest at the arrival.
     pub(crate) fn rest(&mut self, arrival: TimeNs, mut on_sample: impl FnMut(PupilSample)) {
-        if self.batch.is_empty() {
-            return;
+        let mut left = [0; 3];
+        for wire in &self.batch {
+            left[wire.eye.index()] += 1;
         }
-        for eye in SampleEye::ALL {
-            let count = self.batch.iter().filter(|wire| wire.eye == eye).count() as i64;
-            if count > 0 {
-                self.eyes[eye.index()].learn(count, arrival);
-            }
+        for (eye, count) in self.eyes.iter_mut().zip(left).filter(|(_, count)| *count > 0) {
+            eye.learn(count, arrival);
         }
-        for index in 0..self.batch.len() {
-            let wire = self.batch[index];
-            let newer = self.batch[index + 1..].iter().filter(|other| other.eye == wire.eye).count() as i64;
-            let t = self.eyes[wire.eye.index()].stamp(newer, arrival);
+        for wire in self.batch.drain(..) {
+            let newer = &mut left[wire.eye.index()];
+            *newer -= 1;
+            let t = self.eyes[wire.eye.index()].stamp(*newer, arrival);
             on_sample(stamped(&wire, t, t, arrival));
         }
-        self.batch.clear();
     }
 }
 
@@ -127,6 +124,7 @@ fn stamped(wire: &WireSample, t_device: TimeNs, t_sample: TimeNs, arrival: TimeN
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::SampleEye;
 
     const MS: i64 = 1_000_000;
 
@@ -168,14 +166,23 @@ mod tests {
     }
 
     #[test]
-    fn more_than_a_batch_loses_nothing() {
+    fn a_long_stall_is_made_up_in_order() {
         let mut stamper = Stamper::new();
-        let arrival = TimeNs(1_000 * MS);
-        let at_once = (0..BATCH + 10).filter(|_| stamper.take(wire(SampleEye::Both, None), arrival).is_some()).count();
-        let mut rest = 0;
-        stamper.rest(arrival, |_| rest += 1);
-        assert_eq!((at_once, rest), (10, BATCH));
-        stamper.rest(arrival, |_| panic!("nothing is left"));
+        let mut samples = Vec::new();
+        // 250 Hz, one at a time, and then twenty seconds in one read.
+        for (t_ms, count) in (4..=4_000).step_by(4).map(|t_ms| (t_ms, 1)).chain([(24_000, 5_000)]) {
+            let arrival = TimeNs(t_ms * MS);
+            for _ in 0..count {
+                let wire = WireSample { sequence: Some(samples.len() as u64), ..wire(SampleEye::Both, None) };
+                assert_eq!(stamper.take(wire, arrival), None);
+            }
+            stamper.rest(arrival, |sample| samples.push(sample));
+        }
+        assert_eq!(samples.len(), 6_000);
+        for pair in samples.windows(2) {
+            assert_eq!((pair[1].t_sample - pair[0].t_sample).0, 4 * MS, "{pair:?}");
+        }
+        stamper.rest(TimeNs(24_000 * MS), |_| panic!("nothing is left"));
     }
 
     #[test]

@@ -193,7 +193,7 @@ impl Profile {
 
     /// What its sizes are, and what was made of those on the wire.
     pub(crate) const fn figures(&self) -> Figures {
-        Figures { unit: self.unit, mm_per_unit: self.mm_per_unit }
+        Figures { unit: self.unit, mm_per_unit: self.mm_per_unit, recorded_scale: None }
     }
 
     /// A decoder for a stream that may be joined in the middle of a message.

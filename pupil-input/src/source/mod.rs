@@ -20,6 +20,9 @@ use tcp::NetworkError;
 /// How long one read waits; also how soon a stop is noticed.
 pub(crate) const READ_TIMEOUT: Duration = Duration::from_millis(50);
 
+/// No read brings more bytes: the longest datagram there is.
+pub(crate) const LONGEST_READ: usize = 1 << 16;
+
 /// What one read brought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ReadEvent {

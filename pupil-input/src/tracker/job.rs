@@ -81,16 +81,12 @@ impl Job {
         }
     }
 
-    /// What the sizes of a tracker are before the rig's scale, as far as can be told without opening a link (of a HID
-    /// device that its profile does not know to the end, as far as the profile does), and the scale that a recording
-    /// has itself.
-    pub(super) fn unit_unopened(spec: &TrackerSpec) -> Result<(SizeUnit, Option<f64>), TrackerError> {
+    /// [`Self::figures`], as far as can be told without opening a link: of a HID device that its profile does not know
+    /// to the end, as far as the profile does.
+    pub(super) fn figures_unopened(spec: &TrackerSpec) -> Result<Figures, TrackerError> {
         Ok(match Self::profile_unopened(spec)? {
-            Some(profile) => (profile.unit, None),
-            None => {
-                let job = Self::open(spec, TimeNs(0), &[])?;
-                (job.figures().unit, job.recorded_scale())
-            }
+            Some(profile) => profile.figures(),
+            None => Self::open(spec, TimeNs(0), &[])?.figures(),
         })
     }
 
@@ -118,7 +114,7 @@ impl Job {
         match self {
             Self::Live { profile, .. } => profile.figures(),
             Self::Replay { recording, .. } => recording.unit().into(),
-            Self::Rerun { raw, .. } => raw.profile().figures(),
+            Self::Rerun { raw, .. } => Figures { recorded_scale: raw.recorded_scale(), ..raw.profile().figures() },
             Self::Mock { .. } => SizeUnit::Millimetres.into(),
         }
     }
@@ -154,14 +150,6 @@ impl Job {
         match self {
             Self::Replay { recording, .. } => recording.remarks(),
             Self::Live { .. } | Self::Rerun { .. } | Self::Mock { .. } => &[],
-        }
-    }
-
-    /// The scale of the run whose link was recorded.
-    pub(super) fn recorded_scale(&self) -> Option<f64> {
-        match self {
-            Self::Rerun { raw, .. } => raw.recorded_scale(),
-            Self::Live { .. } | Self::Replay { .. } | Self::Mock { .. } => None,
         }
     }
 

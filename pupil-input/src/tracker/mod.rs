@@ -73,10 +73,10 @@ pub fn scaled_millimetres(whose: &str, scale: f64) -> String {
     )
 }
 
-fn check_scale(spec: &TrackerSpec, unit: SizeUnit, scale: Option<f64>) -> Result<(), TrackerError> {
-    match scale {
-        None if unit != SizeUnit::Millimetres => {
-            Err(TrackerError::NoScale { spec: spec.to_string(), unit: unit.name() })
+fn check_scale(spec: &TrackerSpec, figures: Figures, settings: &rig::Tracker) -> Result<(), TrackerError> {
+    match figures.scale(settings) {
+        None if figures.unit != SizeUnit::Millimetres => {
+            Err(TrackerError::NoScale { spec: spec.to_string(), unit: figures.unit.name() })
         }
         _ => Ok(()),
     }
@@ -183,8 +183,7 @@ impl Tracker {
     /// # Errors
     /// The profile, the log or the script is not there or wrong, or the unit wants a scale.
     pub fn examine(spec: &TrackerSpec, settings: &rig::Tracker) -> Result<(), TrackerError> {
-        let (unit, recorded_scale) = Job::unit_unopened(spec)?;
-        check_scale(spec, unit, settings.scale.or(recorded_scale))
+        check_scale(spec, Job::figures_unopened(spec)?, settings)
     }
 
     /// Opens what `spec` names and starts the thread that reads it. In the place of options an origin will do.
@@ -200,12 +199,10 @@ impl Tracker {
         let TrackerOptions { origin, record, forbidden, reader_begins } = options.into();
         let job = Job::open(spec, origin, &forbidden)?;
         let figures = job.figures();
-        let recorded_scale = job.recorded_scale();
-        let scale = settings.scale.or(recorded_scale);
-        check_scale(spec, figures.unit, scale)?;
+        check_scale(spec, figures, settings)?;
         let mut warnings = job.warnings();
         let mut remarks = job.remarks().to_vec();
-        remarks.extend(recorded_scale.map(|recorded| scale_in_words(recorded, settings.scale)));
+        remarks.extend(figures.recorded_scale.map(|recorded| scale_in_words(recorded, settings.scale)));
         warnings.extend(needless_scale(&format!("tracker `{spec}`"), figures.unit, settings));
         let header = job.link().map(|(profile, datagrams)| Header {
             spec: spec.to_string(),
@@ -222,7 +219,7 @@ impl Tracker {
                 .push(format!("tracker `{spec}` is no link, so it has no bytes to record; its samples are recorded"));
         }
         let (taps, recorder) = record.map(|files| record::start(&files, header.as_ref())).transpose()?.unzip();
-        let settings = EstimatorSettings::from(&rig::Tracker { scale, ..settings.clone() });
+        let settings = EstimatorSettings::from(&figures.scaled(settings));
         let (input, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings));
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
         let (troubles, untold) = rtrb::RingBuffer::new(TROUBLES);
@@ -267,7 +264,6 @@ impl Tracker {
                 trouble: None,
                 changes,
                 figures,
-                recorded_scale,
             },
         })
     }
@@ -299,7 +295,6 @@ impl TrackerHandle {
                 trouble: None,
                 changes,
                 figures: SizeUnit::Millimetres.into(),
-                recorded_scale: None,
             },
         }
     }
@@ -354,8 +349,6 @@ pub struct TrackerControl {
     trouble: Option<String>,
     changes: rtrb::Producer<EstimatorSettings>,
     figures: Figures,
-    /// Of a recording of a link: the scale that it has itself.
-    recorded_scale: Option<f64>,
 }
 
 impl TrackerControl {
@@ -410,15 +403,13 @@ impl TrackerControl {
     /// [`ChangeError`]; nothing has changed then.
     pub fn change(&mut self, settings: &rig::Tracker) -> Result<Option<String>, ChangeError> {
         let unit = self.figures.unit;
-        let scale = settings.scale.or(self.recorded_scale);
-        if unit != SizeUnit::Millimetres && scale.is_none() {
+        if unit != SizeUnit::Millimetres && self.figures.scale(settings).is_none() {
             return Err(ChangeError::NoScale(unit.name()));
         }
         if self.finished() {
             return Err(ChangeError::Finished);
         }
-        let scaled = rig::Tracker { scale, ..settings.clone() };
-        self.changes.push((&scaled).into()).map_err(|_| ChangeError::Busy)?;
+        self.changes.push((&self.figures.scaled(settings)).into()).map_err(|_| ChangeError::Busy)?;
         if let Some(thread) = &self.thread {
             thread.thread().unpark();
         }

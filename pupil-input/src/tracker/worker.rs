@@ -21,7 +21,7 @@ use crate::profile::Profile;
 use crate::record::{Kind, ROOM, Taps};
 use crate::sequence::{SequenceEvent, SequenceTracker};
 use crate::simulate::{MockSource, Script};
-use crate::source::{ByteSource, Feed, ReadEvent};
+use crate::source::{ByteSource, Feed, LONGEST_READ, ReadEvent};
 use crate::spec::ReplaySpeed;
 use crate::stamp::Stamper;
 use crate::wire::{Decoder, WireEvent};
@@ -36,8 +36,6 @@ const LONGEST_BACK_OFF: Duration = Duration::from_secs(2);
 const LONG_WAIT: TimeNs = TimeNs(10_000_000_000);
 /// Whoever reads decisions, and has taken none for this long, reads none.
 const UNREAD: TimeNs = TimeNs(1_000_000_000);
-/// The longest datagram there is.
-const BUFFER_BYTES: usize = 1 << 16;
 
 /// The thread's own state. While a link lasts nothing is allocated after its first sample.
 pub(super) struct Worker {
@@ -75,13 +73,14 @@ impl Worker {
         let mut link = Some(open);
         let datagrams = feed.datagrams();
         let mut stream = LiveStream::new(profile, datagrams);
-        let mut buffer = vec![0; BUFFER_BYTES];
+        let mut buffer = vec![0; LONGEST_READ];
         let mut back_off = FIRST_BACK_OFF;
         // What the feed said last.
         let mut is_troubled = false;
         let mut silent_from = host_now() + FIRST_SILENCE;
-        self.connected(host_now());
-        self.estimator.begin(host_now());
+        let opened = host_now();
+        self.connected(opened);
+        self.estimator.begin(opened);
         while self.goes_on() {
             let Some(open) = &mut link else {
                 if !self.wait_until(host_now() + TimeNs(back_off.as_nanos() as i64)) {
@@ -171,7 +170,7 @@ impl Worker {
         if let ReplaySpeed::Times(rate) = speed {
             self.clock = StreamClock { host: origin, stream: raw.begins(), rate };
         }
-        let mut later = TimeNs(0);
+        let (mut later, mut begun) = (TimeNs(0), false);
         loop {
             let mut stream = LiveStream::new(raw.profile(), raw.datagrams());
             // It was read to its end when the tracker was started. What cannot be read any more is its end now.
@@ -196,6 +195,10 @@ impl Worker {
                     Kind::Connected => {
                         stream.rejoin(raw.profile());
                         self.connected(arrival);
+                        // As live, where the link was opened for the first time.
+                        if !std::mem::replace(&mut begun, true) {
+                            self.estimator.begin(arrival);
+                        }
                     }
                     Kind::Bytes => {
                         stream.push(payload, arrival, self);

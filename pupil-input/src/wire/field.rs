@@ -308,9 +308,14 @@ struct Unwrapped {
     last: Option<(u64, i64)>,
 }
 
+/// The greatest number of a counter of so many bits; none of one that never begins again.
+fn wrap_mask(bits: Option<u32>) -> Option<u64> {
+    bits.filter(|bits| *bits < 63).map(|bits| (1_u64 << bits) - 1)
+}
+
 impl Unwrapped {
     fn next(&mut self, raw: i64, bits: Option<u32>) -> i64 {
-        let Some(mask) = bits.filter(|bits| *bits < 63).map(|bits| (1_u64 << bits) - 1) else { return raw };
+        let Some(mask) = wrap_mask(bits) else { return raw };
         let raw = raw as u64 & mask;
         let total = match self.last {
             None => raw as i64,
@@ -326,17 +331,50 @@ impl Unwrapped {
     }
 }
 
+/// Running numbers that begin again at 0, as ones that do not. A step forwards through 0 may be that of a tracker that
+/// has begun anew. It is taken for that where the time of its message falls, or where it is longer than
+/// [`LONGEST_WRAP`].
+#[derive(Clone, Copy, Debug, Default)]
+struct Numbering {
+    counter: Unwrapped,
+    t_device: Option<TimeNs>,
+}
+
+/// Numbers of 16 s at 250 Hz, of 4 s at 1 kHz, and a sixteenth of the range of 16 bits; of wider counters the same share
+/// counts. Few silences of a link last longer, and fewer of them pass 0. No step forwards of 13 bits or fewer is longer:
+/// of 8 bits half a second of samples may be lost, and a restart cannot be told from that by the numbers alone.
+const LONGEST_WRAP: u64 = 4096;
+
+impl Numbering {
+    fn next(&mut self, raw: i64, bits: Option<u32>, t_device: Option<TimeNs>) -> i64 {
+        let time_falls = self.t_device.zip(t_device).is_some_and(|(before, t)| t < before);
+        self.t_device = t_device.or(self.t_device);
+        if let Some((last, _)) = self.counter.last
+            && let Some(mask) = wrap_mask(bits)
+        {
+            let raw = raw as u64 & mask;
+            let step = raw.wrapping_sub(last) & mask;
+            // A clock that is set back, too, falls, and its numbers go on one by one.
+            let is_new = step > 1 && time_falls || step > LONGEST_WRAP.max(mask >> 4);
+            if raw < last && step <= mask / 2 && is_new {
+                self.counter = Unwrapped::default();
+            }
+        }
+        self.counter.next(raw, bits)
+    }
+}
+
 /// Messages to samples.
 #[derive(Clone, Debug)]
 pub(super) struct Fields<P> {
     layout: Layout<P>,
     time: Unwrapped,
-    sequence: Unwrapped,
+    sequence: Numbering,
 }
 
 impl<P> Fields<P> {
     pub(super) fn new(layout: Layout<P>) -> Self {
-        Self { layout, time: Unwrapped::default(), sequence: Unwrapped::default() }
+        Self { layout, time: Unwrapped::default(), sequence: Numbering::default() }
     }
 
     /// Reads a message. A fault of one pupil is an event of its own, with a lost sample behind it where a figure is no
@@ -362,7 +400,7 @@ impl<P> Fields<P> {
         let sequence = match &layout.sequence {
             None => None,
             Some((at, bits)) => {
-                let number = sequence.next(message.raw(at)?.whole_number()?, *bits);
+                let number = sequence.next(message.raw(at)?.whole_number()?, *bits, t_device);
                 Some(u64::try_from(number).map_err(|_| WireFault::BadNumber)?)
             }
         };
@@ -525,6 +563,7 @@ fn nanoseconds(raw: Raw, ns_per_tick: f64, bits: Option<u32>, unwrapped: &mut Un
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sequence::{SequenceEvent, SequenceTracker};
 
     fn field(at: i32, kind: NumberType) -> Field {
         Field { at, kind, big_endian: false, shift: 0, mask: None }
@@ -585,6 +624,48 @@ mod tests {
         assert_eq!([5, 0, 65535].map(|raw| counter.next(raw, Some(16))), [5, 0, 65535]);
         let mut counter = Unwrapped::default();
         assert_eq!([i64::MAX, -1].map(|raw| counter.next(raw, None)), [i64::MAX, -1]);
+    }
+
+    /// What running numbers of so many bits, with times in seconds, tell after the first.
+    fn told(bits: u32, numbers: &[(i64, Option<i64>)]) -> Vec<SequenceEvent> {
+        let (mut numbering, mut tracker) = (Numbering::default(), SequenceTracker::new());
+        let event = |&(raw, t_s): &(i64, Option<i64>)| {
+            let number = numbering.next(raw, Some(bits), t_s.map(|t_s| TimeNs(t_s * 1_000_000_000)));
+            tracker.next(number as u64, SampleEye::Both)
+        };
+        numbers.iter().map(event).skip(1).collect()
+    }
+
+    #[test]
+    fn a_tracker_that_begins_anew_has_lost_no_numbers() {
+        use SequenceEvent::{Gap, InOrder, Repeat, Restart};
+        let timeless = |bits, numbers: &[i64]| told(bits, &numbers.iter().map(|raw| (*raw, None)).collect::<Vec<_>>());
+        assert_eq!(timeless(16, &[39_999, 40_000, 0, 1]), [InOrder, Restart, InOrder]);
+        assert_eq!(timeless(16, &[20_000, 0, 1]), [Restart, InOrder], "a step backwards");
+        assert_eq!(timeless(16, &[65_535, 0, 20_000, 40_000, 2, 3])[1..], [Gap(19_999), Gap(19_999), Restart, InOrder]);
+        assert_eq!(timeless(24, &[(1 << 24) - 1_048_575, 0]), [Gap(1_048_574)]);
+        assert_eq!(timeless(24, &[(1 << 24) - 1_048_576, 0]), [Restart]);
+        // Long silences, with 0 in them and without.
+        assert_eq!(timeless(16, &[64_000, 2_559, 2_560]), [Gap(4_094), InOrder]);
+        assert_eq!(timeless(16, &[64_000, 2_561, 2_562]), [Restart, InOrder]);
+        assert_eq!(timeless(16, &[10, 30_000]), [Gap(29_989)]);
+        assert_eq!(timeless(8, &[200, 70, 71]), [Gap(125), InOrder]);
+        // Where there is a time, it tells.
+        let timed = |bits, numbers: &[(i64, i64)]| {
+            told(bits, &numbers.iter().map(|(raw, t_s)| (*raw, Some(*t_s))).collect::<Vec<_>>())
+        };
+        assert_eq!(timed(16, &[(64_000, 500), (0, 0), (1, 0)]), [Restart, InOrder]);
+        assert_eq!(
+            timed(8, &[(100, 500), (200, 501), (0, 502), (100, 503), (200, 504), (0, 0)]).last(),
+            Some(&Restart)
+        );
+        assert_eq!(timed(16, &[(64_000, 500), (0, 506), (1, 506)]), [Gap(1_535), InOrder]);
+        // A datagram that is overtaken, and a clock that is set back by a second.
+        assert_eq!(
+            timed(16, &[(65_534, 500), (1, 503), (65_535, 501), (2, 504)])[1..],
+            [SequenceEvent::Overtaken { gaps: 0 }, InOrder]
+        );
+        assert_eq!(timed(16, &[(65_535, 500), (0, 499), (0, 499), (1, 499)]), [InOrder, Repeat, InOrder]);
     }
 
     #[test]

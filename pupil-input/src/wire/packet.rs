@@ -357,6 +357,17 @@ mod tests {
         let second = WireSample { eye: SampleEye::Right, diameter_mm: 0.0, confidence: 0.2, valid: false, ..first };
         assert_eq!(events, [WireEvent::Sample(first), WireEvent::Sample(second)]);
 
+        // Its count passes 0, and is anew where the time falls.
+        let numbered = |number: u16, time_us: u32| {
+            let body = [&[0xAA, 0x55][..], &number.to_le_bytes(), &time_us.to_le_bytes(), &body[8..]].concat();
+            let sum = Checksum::new(CRC16).of(&body);
+            [&body[..], &sum.to_le_bytes()].concat()
+        };
+        for (time_us, expected) in [(65_000_000, 65_538), (3_000, 2)] {
+            let events = decoded("example-packet", &[numbered(65_000, 64_000_000), numbered(2, time_us)].concat());
+            assert!(matches!(events[2], WireEvent::Sample(sample) if sample.sequence == Some(expected)), "{events:?}");
+        }
+
         let frame = |number: u8| [0xFA, 0, 0, 0, 1, number, 0x10, 0, 0, 0, 0, 0];
         let events = decoded("asl-eye-trac", &[frame(0), frame(1)].concat());
         let [WireEvent::Sample(first), WireEvent::Sample(second)] = events[..] else { panic!("{events:?}") };

@@ -116,6 +116,40 @@ fn a_recorded_run_plays_again_bit_for_bit() {
 }
 
 #[test]
+fn a_run_whose_tracker_was_silent_at_first_shows_the_same_again() {
+    const MM: f32 = 6.0;
+    let folder = TempDir::new().expect("a folder");
+    let (mut tracker, port) = TTYPort::pair().expect("a PTY");
+    let mut handle = start(&port.name().expect("a path"), Some(RecordFiles::in_folder(folder.path())));
+    std::thread::sleep(Duration::from_secs(1));
+    for sequence in 0..60_u64 {
+        let device_us = sequence as i64 * 5000;
+        let mut line = String::new();
+        let sample = LineSample { sequence, device_us, eye: SampleEye::Both, diameter_mm: MM, confidence: 1.0 };
+        encode_line(&sample, &mut line);
+        tracker.write_all(line.as_bytes()).expect("writes");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    eventually("all samples", || handle.control.counters().of(Counter::Samples) == 60);
+    // When the newest sample was taken.
+    let shown = |handle: &mut TrackerHandle| {
+        handle.control.stop();
+        let newest = decisions(handle).last().expect("samples came").sample;
+        handle.estimate.pupil_at(newest.t_sample)
+    };
+    let live = shown(&mut handle);
+    assert!((live.pupil.mm() - MM).abs() > 0.5, "it came too late to be shown at once: {live:?}");
+    let raw = folder.path().join("tracker.holodraw");
+    for speed in ["max", "1"] {
+        let mut handle = start(&format!("replay:{},speed={speed}", raw.display()), None);
+        eventually("the end", || handle.control.finished());
+        let again = shown(&mut handle);
+        assert_eq!(again.state, live.state, "{speed}");
+        assert!((again.pupil.mm() - live.pupil.mm()).abs() < 1e-3, "{speed}: {again:?}, and live {live:?}");
+    }
+}
+
+#[test]
 fn one_wrong_byte_in_a_recording_is_not_played() {
     let folder = TempDir::new().expect("a folder");
     recorded_run(folder.path());
@@ -197,6 +231,7 @@ fn a_recording_is_played_with_the_scale_of_its_run() {
         eventually("the end", || handle.control.finished());
         handle.control.stop();
         assert!(handle.control.remarks()[0].contains(told), "{:?}", handle.control.remarks());
+        assert_eq!(handle.control.figures().recorded_scale, Some(0.5), "so that a refusal tells the figures that came");
         assert_eq!(fs::read_to_string(&again).expect("reads") == samples, scale.is_none());
         fs::remove_file(again).expect("removes");
     }

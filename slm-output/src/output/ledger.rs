@@ -204,6 +204,7 @@ impl Ledger {
             deadline_missed: !field.repeated && late_ns > timing.frame_period.0 / 2,
         }
     }
+
     /// Why the box could not light the whole window of `field`, where it could not.
     fn why_box_was_dark(&self, field: &ShownField) -> Option<DarkReason> {
         let window = self.gate.window(field);

@@ -103,8 +103,14 @@ fn of_a_compositor_that_tells_no_times_pictures_are_shown_in_its_rhythm_and_none
         let mut bench = open(&compositor, PanelMode::ChannelPacked);
         let reports = reports(&mut bench);
         assert!(reports.iter().all(|report| report.provenance == TimestampSource::Software), "{times:?}");
-        let (first, last) = (reports[0].t_present, reports[reports.len() - 1].t_present);
-        let mean_ms = (last - first).0 as f64 / 1e6 / (reports.len() - 1) as f64;
-        assert!((16.0..20.0).contains(&mean_ms), "{times:?}: {mean_ms} ms between pictures");
+        let mut apart: Vec<_> = reports.windows(2).map(|pair| pair[1].t_present - pair[0].t_present).collect();
+        let mean_ms = apart.iter().map(|apart| apart.0).sum::<i64>() as f64 / 1e6 / apart.len() as f64;
+        apart.sort();
+        let median_ms = apart[apart.len() / 2].0 as f64 / 1e6;
+        // A busy machine misses refreshes, and shows none sooner.
+        assert!(
+            mean_ms >= 16.0 && median_ms < 20.0,
+            "{times:?}: {mean_ms} ms between pictures in the mean, {median_ms} ms in the middle"
+        );
     }
 }

@@ -49,7 +49,7 @@ pub(crate) struct Flip {
 pub(crate) struct Manner {
     /// How long after a refresh its time is told; before it, where negative.
     pub(crate) told_after: TimeNs,
-    /// Every so-manieth picture never comes on the monitor, which is told.
+    /// Every n-th picture never comes on the monitor, which is told.
     pub(crate) leaves_out: Option<u32>,
     pub(crate) times: Times,
 }

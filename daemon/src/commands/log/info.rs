@@ -6,8 +6,8 @@ use std::fmt::Write as _;
 use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
 use holod_pupil_input::{
-    CounterSnapshot, Decision, Estimator, EstimatorSettings, LogInfo, Recording, RefusalChange, RefusalWatch, SizeUnit,
-    Verdict,
+    CounterSnapshot, Decision, Estimator, EstimatorSettings, Figures, LogInfo, Recording, RefusalChange, RefusalWatch,
+    SizeUnit, Verdict,
 };
 use ratatui::style::Color;
 use serde::Serialize;
@@ -61,7 +61,7 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
     let scale = args.scale.or(recording.recorded_scale());
     let info = LogInfo::of(&recording, scale);
     let in_mm = recording.unit() == SizeUnit::Millimetres || scale.is_some();
-    let judged = in_mm.then(|| judge(&recording, scale));
+    let judged = in_mm.then(|| judge(&recording, args.scale));
     if let Some(plot) = &plot {
         let raw = raw_marks(&recording);
         // The gate judges millimetres only.
@@ -92,14 +92,15 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
 }
 
 /// Lets the gate and the filter see the whole log.
-fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
+fn judge(recording: &Recording, given_scale: Option<f64>) -> Judged {
     let mut settings = Rig::default().tracker;
-    settings.scale = scale;
-    let mut estimator = Estimator::new(EstimatorSettings::from(&settings));
+    settings.scale = given_scale;
+    let figures = Figures { recorded_scale: recording.recorded_scale(), ..recording.unit().into() };
+    let mut estimator = Estimator::new(EstimatorSettings::from(&figures.scaled(&settings)));
     let begins = recording.begins();
     let seconds = |t: TimeNs| (t - begins).seconds();
     let mut counts = GateCounts { believed: 0, rejected: BTreeMap::new(), advice: None };
-    let mut watch = RefusalWatch::new(&settings, recording.unit().into(), begins);
+    let mut watch = RefusalWatch::new(&settings, figures, begins);
     let mut decisions = CounterSnapshot::zero();
     let every = step(recording);
     let mut marks = Vec::with_capacity(PLOTTED);

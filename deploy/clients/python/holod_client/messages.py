@@ -63,7 +63,7 @@ def fram(
     field_of_view_deg: tuple[float, float] | None = None,
 ) -> bytes:
     given = (focus_dpt is not None) * _HAS_FOCUS | (field_of_view_deg is not None) * _HAS_FIELD_OF_VIEW
-    across_deg, up_deg = field_of_view_deg or (0.0, 0.0)
+    across_deg, up_deg = (0.0, 0.0) if field_of_view_deg is None else field_of_view_deg
     return _FRAM.pack(b"FRAM", slot, sequence, t_capture_ns, given, focus_dpt or 0.0, across_deg, up_deg)
 
 

@@ -682,6 +682,7 @@ def test_a_picture_says_how_it_was_taken(path: Path) -> None:
             feed.send(colour, focus_dpt=1.25, field_of_view_deg=(60.0, 45.5))
             feed.send(colour, focus_dpt=0.0)
             feed.send(colour)
+            feed.send(colour, focus_dpt=np.float32(0.5), field_of_view_deg=np.array([30.0, 20.0]))
             for view, said in [
                 ({"focus_dpt": 20.5}, "found 20.5, expected 0"),
                 ({"focus_dpt": float("nan")}, "found nan"),
@@ -691,11 +692,11 @@ def test_a_picture_says_how_it_was_taken(path: Path) -> None:
                 with pytest.raises(ValueError, match=said):
                     feed.send(colour, **view)
             feed.wait()
-            assert feed.outcomes.sent == 3, "what is wrong is not sent, and the slot stays"
+            assert feed.outcomes.sent == 4, "what is wrong is not sent, and the slot stays"
         frames = holod.served()
     assert holod.hello().version == 2
     views = [(frame.focus_dpt, frame.field_of_view_deg) for frame in frames]
-    assert views == [(1.25, (60.0, 45.5)), (0.0, None), (None, None)]
+    assert views == [(1.25, (60.0, 45.5)), (0.0, None), (None, None), (0.5, (30.0, 20.0))]
 
 
 def test_a_feed_that_tells_no_view_is_of_version_1(path: Path) -> None:
