@@ -74,7 +74,7 @@ pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -
     text.push_str(&format!("[Service]\nExecStart=\nExecStart={BINARY} run {}\n", command.join(" ")));
     if config != Path::new(USUAL_RIG) {
         let rig = quoted(&config.to_string_lossy());
-        text.push_str(&format!("ExecStopPost=\nExecStopPost=-{BINARY} dark --config {rig}\n"));
+        text.push_str(&format!("ExecStopPost=\nExecStopPost=-{BINARY} dark --after-service --config {rig}\n"));
     }
     if needs.online {
         text.push_str(ONLINE_SERVICE);

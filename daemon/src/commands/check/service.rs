@@ -148,11 +148,13 @@ fn unit_fits(
             for (key, value) in lines_of(&wanted) {
                 let allowed = || unit.all(&key).into_iter().flat_map(str::split_whitespace);
                 let lacks = |word: &&str| !allowed().any(|known| known == *word || known == "any");
+                let is_there = || unit.all(&key).contains(&value.as_str());
                 let missing: Vec<&str> = match key.as_str() {
                     "DeviceAllow" => value.split_whitespace().take(1).filter(lacks).collect(),
                     "IPAddressAllow" | "RestrictAddressFamilies" | "Wants" | "After" => {
                         value.split_whitespace().filter(lacks).collect()
                     }
+                    "ExecStopPost" if !value.is_empty() && !is_there() => vec![&value],
                     _ => Vec::new(),
                 };
                 if !missing.is_empty() {
