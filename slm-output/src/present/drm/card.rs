@@ -14,7 +14,7 @@ use drm::control::{
     property,
 };
 use drm::{ClientCapability, Device, DriverCapability, VblankWaitFlags, VblankWaitTarget};
-use holod_calibration::Resolution;
+use holod_calibration::{Resolution, is_kept_by_unit};
 use memmap2::{MmapMut, MmapOptions};
 use rustix::fs::OFlags;
 use rustix::io::Errno;
@@ -152,10 +152,15 @@ fn mastership(answer: io::Result<()>, of_seat: bool) -> Mastership {
 
 fn open_file(path: &Path) -> Result<File, DrmError> {
     let flags = (OFlags::NONBLOCK | OFlags::CLOEXEC).bits() as i32;
-    OpenOptions::new().read(true).write(true).custom_flags(flags).open(path).map_err(|source| match source.kind() {
+    OpenOptions::new().read(true).write(true).custom_flags(flags).open(path).map_err(|source| not_opened(path, source))
+}
+
+fn not_opened(path: &Path, source: io::Error) -> DrmError {
+    match source.kind() {
+        ErrorKind::PermissionDenied if is_kept_by_unit(&source) => DrmError::NotAllowed { card: path.to_owned() },
         ErrorKind::PermissionDenied => permission(path),
         _ => DrmError::Refused { what: "opening", card: path.to_owned(), source },
-    })
+    }
 }
 
 /// Who may open `path` instead.
@@ -404,6 +409,14 @@ fn uninterrupted<T>(mut call: impl FnMut() -> io::Result<T>) -> io::Result<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_card_that_the_unit_keeps_is_told_from_one_of_another_group() {
+        let says = |errno: Errno| not_opened(Path::new("/dev/dri/card7"), errno.into()).to_string();
+        assert!(says(Errno::PERM).contains("/dev/dri/card7 does not open: the service's unit does not allow"));
+        assert!(says(Errno::ACCESS).contains("permission denied. It belongs to group"));
+        assert!(says(Errno::NODEV).contains("opening on /dev/dri/card7"));
+    }
 
     #[test]
     fn another_master_is_told_from_a_card_that_is_gone() {

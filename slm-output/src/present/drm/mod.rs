@@ -427,9 +427,11 @@ impl DrmError {
             Self::OtherMaster { .. } => PanelFault::MastershipLost,
             Self::Disconnected { .. } | Self::NoSuchConnector { .. } | Self::Ambiguous { .. } => PanelFault::Unplugged,
             Self::OtherSize { .. } | Self::NoSuchMode { .. } | Self::NotAsSent { .. } => PanelFault::ModeRefused,
-            Self::NoCard { .. } | Self::Permission { .. } | Self::NotOfSeat { .. } | Self::Unsupported { .. } => {
-                PanelFault::DeviceLost
-            }
+            Self::NoCard { .. }
+            | Self::Permission { .. }
+            | Self::NotAllowed { .. }
+            | Self::NotOfSeat { .. }
+            | Self::Unsupported { .. } => PanelFault::DeviceLost,
             Self::Refused { source, .. } => match Errno::from_io_error(source).map(fault_of) {
                 Some(fault) if fault.is_recoverable() => fault,
                 _ => PanelFault::DeviceLost,
