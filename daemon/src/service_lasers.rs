@@ -87,7 +87,7 @@ mod tests {
     fn service() -> (tempfile::TempDir, ServiceLasers) {
         let root = tempfile::tempdir().unwrap();
         let [runtime, state] = ["runtime", "state"].map(|name| root.path().join(name));
-        [&runtime, &state].map(|folder| fs::create_dir(folder).unwrap());
+        [&runtime, &state].iter().for_each(|folder| fs::create_dir(folder).unwrap());
         let lasers = ServiceLasers::in_folders(runtime, state);
         (root, lasers)
     }
