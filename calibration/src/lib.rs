@@ -6,6 +6,7 @@
 
 mod atomic_write;
 mod clock;
+mod device;
 mod geometry;
 mod hangup;
 mod level_tables;
@@ -17,6 +18,7 @@ mod units;
 
 pub use atomic_write::{special_file, write_atomically};
 pub use clock::host_now;
+pub use device::{KEPT_BY_UNIT, is_kept_by_unit, unit_keeps};
 pub use geometry::DisplayGeometry;
 pub use hangup::hangup_is_ignored;
 pub use level_tables::LevelTables;

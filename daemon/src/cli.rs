@@ -78,7 +78,7 @@ pub enum Command {
     /// A laser box of holod's protocol stays dark until a holod is started anew, as a service that fails is by itself
     /// (`systemctl stop holod` keeps it from that). Lasers without a heartbeat (READYBeam, lasers that take commands in
     /// text) tell nobody: a holod that goes on may light them again. End it first.
-    Dark(LaserArgs),
+    Dark(DarkArgs),
 }
 
 /// What can be done with the laser box.
@@ -89,7 +89,19 @@ pub enum LaserCommand {
     /// Arm the box with no laser lit, fall silent, and see that it goes dark by itself.
     Arm(LaserArgs),
     /// Put the lasers out.
-    Dark(LaserArgs),
+    Dark(DarkArgs),
+}
+
+/// Which lasers are put out, and when.
+#[derive(Args, Debug, Clone)]
+pub struct DarkArgs {
+    /// Where they are.
+    #[command(flatten)]
+    pub lasers: LaserArgs,
+    /// For the service's `ExecStopPost=`: leave them alone after a start that failed before it opened them, since another
+    /// holod may drive them.
+    #[arg(long)]
+    pub after_service: bool,
 }
 
 /// Where the laser box is.

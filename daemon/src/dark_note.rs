@@ -72,7 +72,7 @@ pub(crate) struct Left {
 impl DarkNote {
     /// That on the lasers of `driver`.
     pub(crate) fn on(driver: &LaserDriver) -> Self {
-        let state = state_folder();
+        let state = runtime_folder::of_service("STATE_DIRECTORY");
         let of_service = state.is_some();
         let named = std::env::var_os(SHARED_VARIABLE).filter(|named| !named.is_empty());
         let shared = std::env::split_paths(&named.unwrap_or_else(|| SHARED.into()))
@@ -246,13 +246,6 @@ fn leave_in(folder: &Path, contents: &BTreeMap<String, String>, name: impl Fn(&s
 fn names(folder: &Path) -> std::io::Result<Vec<String>> {
     let names = fs::read_dir(folder)?.map(|entry| entry.map(|entry| entry.file_name().into_string().ok()));
     names.filter_map(Result::transpose).collect()
-}
-
-/// The state folder of the service that this process is. Its children inherit the variable, and are no service.
-fn state_folder() -> Option<PathBuf> {
-    let named = |name: &str| std::env::var_os(name);
-    let is_service = named("SYSTEMD_EXEC_PID").is_some_and(|pid| *pid == *std::process::id().to_string());
-    named("STATE_DIRECTORY").filter(|_| is_service).map(PathBuf::from).filter(|path| path.is_absolute())
 }
 
 #[cfg(test)]

@@ -26,6 +26,7 @@ pub mod renderer;
 pub mod results;
 mod run_text;
 mod runtime_folder;
+mod service_lasers;
 pub mod session;
 pub mod setup;
 mod snapshot;

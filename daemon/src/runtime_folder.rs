@@ -23,6 +23,13 @@ pub(crate) fn candidates() -> Vec<PathBuf> {
     named("RUNTIME_DIRECTORY").into_iter().chain(runtime).chain([temporary]).collect()
 }
 
+/// The folder that systemd made for the service that this process is, by the variable that names it. Its children inherit
+/// the variable, and are no service.
+pub(crate) fn of_service(variable: &str) -> Option<PathBuf> {
+    let is_service = std::env::var_os("SYSTEMD_EXEC_PID").is_some_and(|pid| *pid == *std::process::id().to_string());
+    std::env::var_os(variable).filter(|_| is_service).map(PathBuf::from).filter(|path| path.is_absolute())
+}
+
 /// Makes the folder of a run again where it is gone; false where it cannot be, or is somebody else's by now.
 pub(crate) fn make_again(folder: &Path) -> bool {
     if is_own(folder) {

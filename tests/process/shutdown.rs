@@ -75,6 +75,48 @@ impl LaserBench {
         daemon
     }
 
+    /// Starts holod as systemd does for its service: with a state folder that stays, and a runtime folder.
+    fn as_service(&self, args: &[&str]) -> Daemon {
+        const SERVICE: &str = "SYSTEMD_EXEC_PID=$$ STATE_DIRECTORY=\"$PWD/state\" RUNTIME_DIRECTORY=\"$PWD/runtime\" \
+            exec \"$0\" \"$@\"";
+        Daemon::start_with("/bin/sh", &[&["-c", SERVICE, HOLOD], args].concat(), self.folder.path(), &[])
+    }
+
+    /// A start, which begins with an empty runtime folder.
+    fn start_service(&self, rig: &str) -> Daemon {
+        let folder = |name: &str| self.folder.path().join(name);
+        let _the_first_time = fs::remove_dir_all(folder("runtime"));
+        fs::create_dir(folder("runtime")).unwrap();
+        fs::create_dir_all(folder("state")).unwrap();
+        fs::write(folder("faulty.toml"), "name = 1").unwrap();
+        self.as_service(&["--config", rig, "--tracker", "mock:steady", "--resolution", "64x64", "--weights", "small"])
+    }
+
+    /// The exit code of a start that fails.
+    fn service_fails(&self, rig: &str) -> Option<i32> {
+        self.start_service(rig).wait(Duration::from_secs(60)).status.code()
+    }
+
+    /// A start whose lasers are lit, and then a signal.
+    fn service_ends_by(&self, signal: Signal) {
+        let lit_before = self.edges().len();
+        let service = self.start_service("rig.toml");
+        assert!(wait_until(Duration::from_secs(60), || self.edges().len() > lit_before + 10), "lit at first");
+        service.signal(signal);
+        let _ended = service.wait(Duration::from_secs(20));
+    }
+
+    /// What the unit's `ExecStopPost=` says after a start, and whether it succeeds.
+    fn after_service(&self) -> (String, bool) {
+        let ended = self.as_service(&["dark", "--after-service", "--config", "rig.toml"]).wait(Duration::from_secs(60));
+        (format!("{}{}", ended.stdout, ended.stderr), ended.status.success())
+    }
+
+    fn assert_left_alone_after_service(&self) {
+        let (said, succeeds) = self.after_service();
+        assert!(succeeds && said.contains("they are left as they are"), "{said}");
+    }
+
     fn assert_dark(&self) {
         let edges = self.edges();
         for pair in edges.chunks(2) {
@@ -213,6 +255,48 @@ fn what_a_person_put_out_of_a_service_stays_dark_by_hand_and_the_other_way() {
         assert!(ended.stderr.contains("the lasers stay dark"), "first a service: {of_service}; {}", ended.stderr);
         assert_eq!(laser_box.edges().len(), lit_before, "nothing was lit since");
     }
+}
+
+#[test]
+fn a_service_that_never_opened_its_lasers_leaves_those_of_a_run_by_hand_lit() {
+    let laser_box = LaserBench::plug_in();
+    let by_hand = laser_box.lit_daemon();
+    assert_eq!(laser_box.service_fails("rig.toml"), Some(69), "the port is in use");
+    laser_box.assert_left_alone_after_service();
+    assert_eq!(laser_box.service_fails("faulty.toml"), Some(78));
+    laser_box.assert_left_alone_after_service();
+    let lit_before = laser_box.edges().len();
+    assert!(wait_until(Duration::from_secs(30), || laser_box.edges().len() > lit_before + 10), "the first one goes on");
+    let made_dark = |event: &BoxEvent| matches!(event, BoxEvent::Dark { reason: DarkReason::ByHand, .. });
+    assert!(!laser_box.events().iter().any(made_dark));
+    by_hand.signal(Signal::TERM);
+    assert!(by_hand.wait(Duration::from_secs(20)).status.success());
+}
+
+#[test]
+fn a_service_that_opened_its_lasers_has_them_put_out_however_it_ended() {
+    let laser_box = LaserBench::plug_in();
+    for signal in [Signal::KILL, Signal::ABORT, Signal::TERM] {
+        laser_box.service_ends_by(signal);
+        let (said, succeeds) = laser_box.after_service();
+        assert!(succeeds && said.contains("acknowledged"), "{signal:?}: {said}");
+    }
+}
+
+#[test]
+fn lasers_that_did_not_acknowledge_are_told_again_after_later_starts_of_the_service() {
+    let mut laser_box = LaserBench::plug_in();
+    laser_box.service_ends_by(Signal::KILL);
+    laser_box.unplug();
+    assert!(!laser_box.after_service().1);
+    assert_eq!(laser_box.service_fails("rig.toml"), Some(69), "there is no port");
+    assert!(!laser_box.after_service().1);
+    laser_box.plug_in_again();
+    assert_eq!(laser_box.service_fails("faulty.toml"), Some(78));
+    let (said, succeeds) = laser_box.after_service();
+    assert!(succeeds && said.contains("acknowledged"), "{said}");
+    assert_eq!(laser_box.service_fails("faulty.toml"), Some(78));
+    laser_box.assert_left_alone_after_service();
 }
 
 #[test]

@@ -39,11 +39,14 @@ LOSSES = {
     "seat_thief": "another program took the display over",
     "seat_manager": "the graphics device was lost",
     "unplug": "the panel was unplugged",
+    "other_monitor": "the panel was unplugged",
+    "unplug_and_removal": "the graphics device was lost",
     "removal": "the graphics device was lost",
 }
 # The seat manager takes mastership away before it says so, and with its own end before that is noticed: a flip may come
-# between.
+# between. A panel is unplugged before its card goes.
 LOST_AT_FIRST = dict.fromkeys(["seat", "seat_manager"], "another program took the display over")
+LOST_AT_FIRST["unplug_and_removal"] = "the panel was unplugged"
 # Runs whose card a seat manager opens, for a user who may not.
 SEATED = ["seat", "seat_thief", "seat_manager"]
 # Runs during which another terminal was in front: without a seat manager nothing is lost.

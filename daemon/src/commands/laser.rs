@@ -10,8 +10,9 @@ use holod_slm_output::laser::{
 };
 use holod_slm_output::schedule::FieldGate;
 
-use crate::cli::{LaserArgs, LaserCommand};
+use crate::cli::{DarkArgs, LaserArgs, LaserCommand};
 use crate::failure::{Exit, Failure};
+use crate::service_lasers::ServiceLasers;
 use crate::{results, setup};
 
 /// How long beyond its own timeout a box is waited for that should go dark by itself.
@@ -25,9 +26,25 @@ pub(super) fn laser(command: &LaserCommand) -> Result<(), Failure> {
     }
 }
 
+/// Puts the lasers out, unless it is run after a service's start that never opened them.
+pub(super) fn dark(args: &DarkArgs) -> Result<(), Failure> {
+    let Some(service) = ServiceLasers::of_this_process().filter(|_| args.after_service) else {
+        return put_out(&args.lasers);
+    };
+    if service.are_untouched() {
+        return results::print(
+            "the service failed before it opened the lasers: they are left as they are, since another holod may drive them",
+        );
+    }
+    service.owe_darkness();
+    put_out(&args.lasers)?;
+    service.are_dark();
+    Ok(())
+}
+
 /// Puts the lasers out, whoever else has their ports open. The built-in rig has none: without a rig or a port nothing
 /// would be put out.
-pub(super) fn dark(args: &LaserArgs) -> Result<(), Failure> {
+fn put_out(args: &LaserArgs) -> Result<(), Failure> {
     if args.rig.config.is_none() && args.port.is_none() {
         let which = "holod dark: which lasers? say --config RIG, the rig file of the holod that drives them, or --port \
                      PATH, the port of a laser box; nothing was put out";

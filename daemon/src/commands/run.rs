@@ -19,6 +19,7 @@ use crate::page::{self, Page};
 use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, RecordFolder, RecordHealth, Recorder};
+use crate::service_lasers::ServiceLasers;
 use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
 use crate::{results, run_text, setup, source};
 
@@ -28,6 +29,7 @@ const SAMPLE_TRACKER: &str = "mock";
 const SAVING: Duration = Duration::from_secs(30);
 
 pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
+    ServiceLasers::of_this_process().inspect(ServiceLasers::begin);
     let output: OutputSpec = args.output.parse().map_err(Failure::because(Exit::Usage))?;
     if let Some(spec) = &args.tracker
         && let Some(report) = report_of(spec)?

@@ -26,6 +26,11 @@ pub(super) const USUAL_RIG: &str = "/etc/holod/rig.toml";
 pub(super) const STATE_FOLDER: &str = "/var/lib/holod";
 /// Networks that no address of the wider Internet is in.
 const PRIVATE_NETWORKS: &str = "link-local 192.168.0.0/16 10.0.0.0/8 172.16.0.0/12 fc00::/7";
+/// For a start that fails where the network is not up: it waits for that,
+const ONLINE_UNIT: &str = "[Unit]\nWants=network-online.target\nAfter=network-online.target\n";
+/// and since the target may be reached earlier than an address or a route is there, the starts that the unit grants are
+/// spread over more than half a minute. Lasers are dark between them.
+const ONLINE_SERVICE: &str = "RestartSec=10\n";
 
 pub(super) fn unit(args: &UnitArgs) -> Result<(), Failure> {
     let words = std::env::args_os().skip_while(|word| word != "unit").skip(1).map(OsString::into_string);
@@ -58,17 +63,22 @@ pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -
         return Err(usage(format!("--record-in {found}: the service may write below {STATE_FOLDER} only")));
     }
     run::judge(run, rig)?;
+    let needs = needs(rig, run, root)?;
     let command: Vec<String> = words.iter().map(|word| quoted(word)).collect();
-    let mut text = format!(
-        "# Written by `holod unit`: what this bench needs of the unit. Write it anew when rig or devices change.\n\
-         [Service]\nExecStart=\nExecStart={BINARY} run {}\n",
-        command.join(" ")
-    );
+    let mut text =
+        "# Written by `holod unit`: what this bench needs of the unit. Write it anew when rig or devices change.\n"
+            .to_owned();
+    if needs.online {
+        text.push_str(ONLINE_UNIT);
+    }
+    text.push_str(&format!("[Service]\nExecStart=\nExecStart={BINARY} run {}\n", command.join(" ")));
     if config != Path::new(USUAL_RIG) {
         let rig = quoted(&config.to_string_lossy());
-        text.push_str(&format!("ExecStopPost=\nExecStopPost=-{BINARY} dark --config {rig}\n"));
+        text.push_str(&format!("ExecStopPost=\nExecStopPost=-{BINARY} dark --after-service --config {rig}\n"));
     }
-    let needs = needs(rig, run, root)?;
+    if needs.online {
+        text.push_str(ONLINE_SERVICE);
+    }
     for device in &needs.devices {
         text.push_str(&format!("DeviceAllow={device} rw\n"));
     }
@@ -87,12 +97,35 @@ struct Needs {
     network: bool,
     /// Other machines' addresses, as systemd writes them.
     hosts: BTreeSet<String>,
+    /// Whether it cannot start before the network is up.
+    online: bool,
+}
+
+/// What a host is to the run.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Role {
+    /// Another machine, which it connects to.
+    Peer,
+    /// This machine, which it listens on; who sends is known when somebody does.
+    Own,
 }
 
 impl Needs {
-    fn allow(&mut self, hosts: &str) {
+    fn reach(&mut self, host: &str, role: Role, root: &Path) {
         self.network = true;
-        self.hosts.insert(hosts.to_owned());
+        let address = host.parse::<IpAddr>().ok();
+        if host.eq_ignore_ascii_case("localhost") || address.is_some_and(|address| address.is_loopback()) {
+            return;
+        }
+        self.hosts.insert(match address {
+            Some(address) if role == Role::Peer => address.to_string(),
+            _ => bench_networks(root),
+        });
+        if address.is_none() {
+            self.hosts.extend(name_servers(root));
+        }
+        // All of this machine's addresses can be listened on before there is one.
+        self.online |= !address.is_some_and(|address| address.is_unspecified());
     }
 }
 
@@ -109,18 +142,14 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
             }
             TrackerSpec::Hid { .. } => needs.devices.extend(["char-hidraw".to_owned()]),
             TrackerSpec::Tcp { address, .. } | TrackerSpec::Core(address) | TrackerSpec::Neon(address) => {
-                let address = address.host.parse::<IpAddr>();
-                needs.allow(&address.map_or_else(|_| bench_networks(root), |address| address.to_string()));
+                needs.reach(&address.host, Role::Peer, root);
             }
-            // The address is this machine's own; the tracker's is known when it sends.
-            TrackerSpec::Udp { .. } => needs.allow(&bench_networks(root)),
+            TrackerSpec::Udp { address, .. } => needs.reach(&address.host, Role::Own, root),
             TrackerSpec::Path(_) | TrackerSpec::Replay { .. } | TrackerSpec::Mock(_) | TrackerSpec::MockFile(_) => {}
         }
     }
-    match &run.page.page {
-        Some(PageAddress::Tcp(address)) if address.ip().is_loopback() => needs.network = true,
-        Some(PageAddress::Tcp(_)) => needs.allow(&bench_networks(root)),
-        Some(PageAddress::Unix(_)) | None => {}
+    if let Some(PageAddress::Tcp(address)) = &run.page.page {
+        needs.reach(&address.ip().to_string(), Role::Own, root);
     }
     match run.output.parse().map_err(Failure::because(Exit::Usage))? {
         OutputSpec::Headless(_) => {}
@@ -138,11 +167,27 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
     Ok(needs)
 }
 
+/// Who is asked for names, where these are no addresses that are allowed anyway: systemd-resolved and avahi are asked
+/// over Unix sockets or at a loopback address, but without them the C library asks the machine's name servers itself.
+fn name_servers(root: &Path) -> Vec<String> {
+    let text = read_below(root, "/etc/resolv.conf");
+    let named = text.lines().filter_map(|line| line.trim().strip_prefix("nameserver")?.split_whitespace().next());
+    let addresses = named.filter_map(|server| server.split('%').next()?.parse::<IpAddr>().ok());
+    let is_allowed = |address: &IpAddr| match address {
+        IpAddr::V4(address) => address.is_private() || address.is_link_local() || address.is_loopback(),
+        IpAddr::V6(address) => address.is_unique_local() || address.is_unicast_link_local() || address.is_loopback(),
+    };
+    addresses.filter(|address| !is_allowed(address)).map(|address| address.to_string()).collect()
+}
+
+fn read_below(root: &Path, file: &str) -> String {
+    fs::read_to_string(below(root, Path::new(file))).unwrap_or_default()
+}
+
 /// Where a page is looked at from, and a tracker may be that has a name and no address: private networks, and those
 /// that this machine is in.
 fn bench_networks(root: &Path) -> String {
-    let read = |file: &str| fs::read_to_string(below(root, Path::new(file))).unwrap_or_default();
-    let (v4, v6) = (read("/proc/net/route"), read("/proc/net/if_inet6"));
+    let (v4, v6) = (read_below(root, "/proc/net/route"), read_below(root, "/proc/net/if_inet6"));
     let own = v4.lines().filter_map(own_network_v4).chain(v6.lines().filter_map(own_network_v6));
     let own: BTreeSet<String> = own.collect();
     own.iter().fold(PRIVATE_NETWORKS.to_owned(), |all, network| format!("{all} {network}"))
@@ -412,6 +457,52 @@ mod tests {
         assert!(with("core:192.0.2.7").contains("IPAddressAllow=localhost 192.0.2.7\n"));
         assert!(with("neon").contains("IPAddressAllow=localhost link-local 192.168.0.0/16"));
         assert!(with("hid:1209:0001").contains("DeviceAllow=char-hidraw rw"));
+        for here in ["core:127.0.0.1", "core:localhost", "udp:[::1]:4242,profile=open-gaze"] {
+            assert!(with(here).contains("IPAddressAllow=localhost\n"), "{here}: {}", with(here));
+        }
+    }
+
+    #[test]
+    fn what_needs_the_network_at_its_start_waits_for_it() {
+        let root = machine();
+        let with = |words: &[&str]| drop_in_of(&[&RIG[..], words].concat(), &rig(), root.path()).unwrap();
+        let waits = |text: &str| {
+            let unit = text.contains("\n[Unit]\nWants=network-online.target\nAfter=network-online.target\n[Service]\n");
+            assert_eq!(unit, text.contains("network-online"), "{text}");
+            assert_eq!(unit, text.contains("\nRestartSec=10\n"), "{text}");
+            unit
+        };
+        let token = ["--page-token", "/etc/holod/token"];
+        for page in ["192.168.1.5:8420", "[2001:db8::7]:8420"] {
+            assert!(waits(&with(&[&["--page", page], &token[..]].concat())), "{page}");
+        }
+        for tracker in ["core:192.0.2.7", "neon", "tcp:gazepc,profile=open-gaze", "udp:192.0.2.7:1,profile=open-gaze"] {
+            assert!(waits(&with(&["--tracker", tracker])), "{tracker}");
+        }
+        for page in ["8420", "[::1]:8420", "unix:/run/holod/page"] {
+            assert!(!waits(&with(&["--page", page])), "{page}");
+        }
+        assert!(!waits(&with(&[&["--page", "0.0.0.0:8420"], &token[..]].concat())), "there is one for all addresses");
+        for tracker in ["mock", "core:localhost", "core:127.0.0.1", "udp:0.0.0.0:1,profile=open-gaze"] {
+            assert!(!waits(&with(&["--tracker", tracker])), "{tracker}");
+        }
+    }
+
+    #[test]
+    fn the_servers_that_know_a_trackers_name_may_be_asked() {
+        let root = machine();
+        fs::create_dir_all(root.path().join("etc")).unwrap();
+        let allowed = |spec: &str, servers: &str| {
+            fs::write(root.path().join("etc/resolv.conf"), servers).unwrap();
+            let text = drop_in_of(&[&RIG[..], &["--tracker", spec]].concat(), &rig(), root.path()).unwrap();
+            text.lines().find_map(|line| line.strip_prefix("IPAddressAllow=").map(str::to_owned)).unwrap()
+        };
+        let servers = "# nameserver 192.0.2.1\nsearch uni.example\nnameserver 192.0.2.53 # of the institute\n\
+            nameserver 2001:db8::53\nnameserver 127.0.0.53\nnameserver 192.168.1.1\nnameserver fe80::1%eth0\n";
+        let named = format!("localhost 192.0.2.53 2001:db8::53 {PRIVATE_NETWORKS}");
+        assert_eq!(allowed("tcp:gazepc.uni.example,profile=open-gaze", servers), named);
+        assert_eq!(allowed("core:192.0.2.7", servers), "localhost 192.0.2.7", "an address is not asked for");
+        assert_eq!(allowed("neon", "nameserver 127.0.0.53\n"), format!("localhost {PRIVATE_NETWORKS}"));
     }
 
     #[test]

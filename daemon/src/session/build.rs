@@ -35,6 +35,7 @@ use crate::dark_note::{DarkNote, Found};
 use crate::failure::{Exit, Failure};
 use crate::record::FrameOrders;
 use crate::renderer::{self, Renderer, Use};
+use crate::service_lasers::ServiceLasers;
 use crate::source::{OpenPictures, Pictures};
 use crate::status::{self, StatusFile};
 use crate::{progress, setup, source, speed};
@@ -135,9 +136,8 @@ pub(super) fn build(
         stall_timeout: rig.lasers.stall_timeout.unwrap_or_else(|| stall_timeout(frame_time)),
         look: observer.wants_look(),
     };
-    let output = progress::during("opening panel and lasers", || {
-        scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
-    })?;
+    let output =
+        progress::during("opening panel and lasers", || scheduling::prompt(|| open_output(&plan, &encoder, options)))?;
     output.control.attend();
     let dark_note = DarkNote::on(&rig.lasers.driver);
     let found = dark_note.look();
@@ -304,13 +304,16 @@ fn replay_ends_run(plan: &SessionPlan) -> bool {
     }
 }
 
-fn open_output(plan: &SessionPlan, encoder: &PanelEncoder, options: OutputOptions) -> Result<Output, OutputError> {
+fn open_output(plan: &SessionPlan, encoder: &PanelEncoder, options: OutputOptions) -> Result<Output, Failure> {
     let rig = &plan.rig;
-    let panel = open_panel(&plan.output, &PanelSetup::new(&rig.panel, encoder), host_now())?;
+    let unavailable = Failure::because::<OutputError>(Exit::Unavailable);
+    let panel = open_panel(&plan.output, &PanelSetup::new(&rig.panel, encoder), host_now());
+    let panel = panel.map_err(|error| unavailable(error.into()))?;
     #[cfg(feature = "fault-injection")]
     let panel = Box::new(crate::fault::FaultyPanel(panel));
-    let laser = open_laser(&rig.lasers, host_now)?;
-    Output::start(rig, encoder, panel, laser, options, host_now)
+    let laser = open_laser(&rig.lasers, host_now).map_err(|error| unavailable(error.into()))?;
+    ServiceLasers::of_this_process().map_or(Ok(()), |service| service.open())?;
+    Output::start(rig, encoder, panel, laser, options, host_now).map_err(unavailable)
 }
 
 /// How long a frame takes, measured before anything is shown: the second one, unless the first took very long. A GPU's

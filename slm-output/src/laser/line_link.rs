@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{TimeNs, unit_keeps};
 use rtrb::{Consumer, Producer, RingBuffer};
 use serialport::TTYPort;
 
@@ -141,14 +141,10 @@ pub(super) enum Sharing {
 /// dark while this one hangs. An advisory lock tells two programs apart that both mean to drive it.
 ///
 /// # Errors
-/// [`LaserError::Open`], [`LaserError::InUse`].
+/// [`LaserError::Open`], [`LaserError::NotAllowed`], [`LaserError::InUse`].
 pub(super) fn open_port(path: &Path, baud: u32, sharing: Sharing) -> Result<[TTYPort; 2], LaserError> {
     let name = path.display().to_string();
-    let failed = |why: serialport::Error| match why.kind() {
-        serialport::ErrorKind::NoDevice if path.exists() => LaserError::InUse { path: name.clone() },
-        serialport::ErrorKind::Io(ErrorKind::ResourceBusy) => LaserError::InUse { path: name.clone() },
-        _ => LaserError::Open { path: name.clone(), why: why.to_string() },
-    };
+    let failed = |why| not_opened(path, &why, || unit_keeps(path));
     let builder = serialport::new(name.as_str(), baud).timeout(Duration::ZERO);
     let mut writer = builder.exclusive(sharing == Sharing::Alone).open_native().map_err(failed)?;
     if sharing == Sharing::Alone {
@@ -161,10 +157,41 @@ pub(super) fn open_port(path: &Path, baud: u32, sharing: Sharing) -> Result<[TTY
     Ok([reader, writer])
 }
 
+/// What it means that the port at `path` does not open; `unit_keeps` says whether the service's unit does not allow it.
+fn not_opened(path: &Path, why: &serialport::Error, unit_keeps: impl FnOnce() -> bool) -> LaserError {
+    let name = path.display().to_string();
+    match why.kind() {
+        serialport::ErrorKind::NoDevice if path.exists() => LaserError::InUse { path: name },
+        serialport::ErrorKind::Io(ErrorKind::ResourceBusy) => LaserError::InUse { path: name },
+        serialport::ErrorKind::Io(ErrorKind::PermissionDenied) if unit_keeps() => LaserError::NotAllowed { path: name },
+        _ => LaserError::Open { path: name, why: why.to_string() },
+    }
+}
+
 /// Makes reads of a port whose bytes another program has just taken return at once. Its clones do the same.
 fn never_wait(port: &TTYPort) -> io::Result<()> {
     // SAFETY: the port stays open, and so its descriptor valid, for as long as it is borrowed here.
     let port = unsafe { BorrowedFd::borrow_raw(port.as_raw_fd()) };
     let flags = rustix::fs::fcntl_getfl(port)?;
     Ok(rustix::fs::fcntl_setfl(port, flags | rustix::fs::OFlags::NONBLOCK)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use holod_calibration::is_kept_by_unit;
+
+    use super::*;
+
+    #[test]
+    fn a_port_that_the_unit_keeps_is_told_from_one_of_another_group() {
+        let says = |errno: i32| {
+            let error = io::Error::from_raw_os_error(errno);
+            let why = serialport::Error::new(serialport::ErrorKind::Io(error.kind()), error.to_string());
+            not_opened(Path::new("/dev/null"), &why, || is_kept_by_unit(&error)).to_string()
+        };
+        let [not_permitted, access, busy] = [1, 13, 16].map(says);
+        assert!(not_permitted.starts_with("/dev/null does not open: the service's unit"), "{not_permitted}");
+        assert!(access.ends_with("the cable and the port's permissions"), "{access}");
+        assert!(busy.contains("in use by another program"), "{busy}");
+    }
 }

@@ -35,7 +35,7 @@ pub use reconnect::LaserWatch;
 pub use serial_box::{BoxReport, SerialBox, SerialOptions};
 pub use simulated::SimulatedLaser;
 
-use holod_calibration::{Colour, PerColour, TimeNs};
+use holod_calibration::{Colour, KEPT_BY_UNIT, PerColour, TimeNs};
 
 use crate::fields::FIELDS;
 
@@ -159,6 +159,9 @@ pub enum LaserError {
         /// What the system said.
         why: String,
     },
+    /// The port may not be opened whatever its mode is.
+    #[error("{path} does not open: {KEPT_BY_UNIT}")]
+    NotAllowed { path: String },
     /// What answers is no laser box of this protocol.
     #[error(
         "{path}: answered `{found}`; expected `{expected}`: check that lasers.device names the laser box and not another device"

@@ -202,7 +202,7 @@ pub(super) fn require_acceptance(lasers: &Lasers) -> Result<(), LaserError> {
 /// acknowledges that, whatever else it says.
 ///
 /// # Errors
-/// The last try's, after some seconds; [`LaserError::Line`] and [`LaserError::Open`] at once.
+/// The last try's, after some seconds; [`LaserError::Line`], [`LaserError::Open`] and [`LaserError::NotAllowed`] at once.
 pub(super) fn put_out_beside<D>(
     clock: fn() -> TimeNs,
     open: impl Fn() -> Result<D, LaserError>,
@@ -225,7 +225,9 @@ pub(super) fn put_out_beside<D>(
     loop {
         match attempt() {
             Ok(()) => return Ok(()),
-            Err(final_one @ (LaserError::Line(_) | LaserError::Open { .. })) => return Err(final_one),
+            Err(final_one @ (LaserError::Line(_) | LaserError::Open { .. } | LaserError::NotAllowed { .. })) => {
+                return Err(final_one);
+            }
             Err(last) if clock() >= t_end => return Err(last),
             Err(_) => std::thread::sleep(BESIDE_REST),
         }

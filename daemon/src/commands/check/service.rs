@@ -148,9 +148,13 @@ fn unit_fits(
             for (key, value) in lines_of(&wanted) {
                 let allowed = || unit.all(&key).into_iter().flat_map(str::split_whitespace);
                 let lacks = |word: &&str| !allowed().any(|known| known == *word || known == "any");
+                let is_there = || unit.all(&key).contains(&value.as_str());
                 let missing: Vec<&str> = match key.as_str() {
                     "DeviceAllow" => value.split_whitespace().take(1).filter(lacks).collect(),
-                    "IPAddressAllow" | "RestrictAddressFamilies" => value.split_whitespace().filter(lacks).collect(),
+                    "IPAddressAllow" | "RestrictAddressFamilies" | "Wants" | "After" => {
+                        value.split_whitespace().filter(lacks).collect()
+                    }
+                    "ExecStopPost" if !value.is_empty() && !is_there() => vec![&value],
                     _ => Vec::new(),
                 };
                 if !missing.is_empty() {
@@ -438,6 +442,7 @@ mod tests {
         let machine = Machine::new();
         machine.edit_drop_in("--output drm:DP-1", "--output drm:DP-1 --tracker core:192.0.2.7");
         machine.fault("unit", &["RestrictAddressFamilies= lacks AF_INET, AF_INET6", "IPAddressAllow= lacks localhost"]);
+        machine.fault("unit", &["Wants= lacks network-online.target", "After= lacks network-online.target"]);
         let machine = Machine::new();
         machine.edit_drop_in("--output drm:DP-1", "--output drm:DP-1 --no-such-option");
         machine.fault("unit", &["--no-such-option", "write it anew"]);
@@ -468,13 +473,23 @@ mod tests {
 
     #[test]
     fn a_bench_that_fails_soon_after_its_start_is_not_started_for_ever_however_slowly_it_fails() {
-        let unit = Unit::read(Machine::new().root()).unwrap();
-        let figure = |key: &str| unit.all(key).last().and_then(|value| value.parse::<u64>().ok()).unwrap();
-        // It says nothing until it is given up, or its first frame stays; then it does not end by itself.
-        let slowest_s: u64 =
-            ["TimeoutStartSec", "WatchdogSec", "TimeoutStopSec", "RestartSec"].map(figure).into_iter().sum();
-        let interval_s = figure("StartLimitIntervalSec");
-        assert!(figure("StartLimitBurst") * slowest_s <= interval_s, "{slowest_s} s a start, {interval_s} s");
+        let machine = Machine::new();
+        let pause_s = || {
+            let unit = Unit::read(machine.root()).unwrap();
+            let figure = |key: &str| unit.all(key).last().and_then(|value| value.parse::<u64>().ok()).unwrap();
+            // It says nothing until it is given up, or its first frame stays; then it does not end by itself.
+            let slowest_s: u64 =
+                ["TimeoutStartSec", "WatchdogSec", "TimeoutStopSec", "RestartSec"].map(figure).into_iter().sum();
+            let interval_s = figure("StartLimitIntervalSec");
+            assert!(figure("StartLimitBurst") * slowest_s <= interval_s, "{slowest_s} s a start, {interval_s} s");
+            (figure("StartLimitBurst") - 1) * figure("RestartSec")
+        };
+        pause_s();
+        machine.write_drop_in(&["--output", "drm:DP-1", "--tracker", "core:192.0.2.7"]);
+        assert!(pause_s() > 30, "a network may be so late");
+        let example = include_str!("../../../../deploy/systemd/holod.service.d/network-tracker.conf");
+        machine.put("etc/systemd/system/holod.service.d/bench.conf", example);
+        assert!(pause_s() > 30, "a network may be so late");
     }
 
     #[test]

@@ -7,10 +7,11 @@ mod rule;
 mod select;
 
 use std::fs::File;
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use hidapi::{BusType, HidApi, HidDevice, MAX_REPORT_DESCRIPTOR_SIZE};
+use holod_calibration::{KEPT_BY_UNIT, is_kept_by_unit};
 
 pub use rule::{RULE_FILE, udev_rule};
 pub(crate) use select::Wanted;
@@ -65,6 +66,13 @@ pub enum HidError {
         path: PathBuf,
         /// The udev rule that grants it.
         rule: String,
+    },
+    /// Its node may not be opened whatever its mode is.
+    #[error("HID tracker {ids} at {path} does not open: {KEPT_BY_UNIT}")]
+    NotAllowed {
+        /// Its vendor and product.
+        ids: UsbIds,
+        path: PathBuf,
     },
     /// It is there and does not open.
     #[error(
@@ -279,10 +287,36 @@ fn open(api: &HidApi, path: &Path, ids: UsbIds) -> Result<HidDevice, HidError> {
         },
         Err(error) => error.to_string(),
     };
-    match File::options().read(true).write(true).open(path) {
+    let again = File::options().read(true).write(true).open(path).map(drop);
+    Err(not_opened(path, ids, again, said))
+}
+
+/// What it means that a node does not open, which hidapi `said`, and opening it `again` came to.
+fn not_opened(path: &Path, ids: UsbIds, again: io::Result<()>, said: String) -> HidError {
+    let path = path.into();
+    match again {
+        Err(error) if is_kept_by_unit(&error) => HidError::NotAllowed { ids, path },
         Err(error) if error.kind() == ErrorKind::PermissionDenied => {
-            Err(HidError::Permission { ids, path: path.into(), rule: udev_rule(ids) })
+            HidError::Permission { ids, path, rule: udev_rule(ids) }
         }
-        _ => Err(HidError::Open { ids, path: path.into(), reason: said }),
+        _ => HidError::Open { ids, path, reason: said },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_node_that_the_unit_keeps_is_told_from_one_without_a_rule() {
+        let ids = UsbIds { vendor: 0x1209, product: 1 };
+        let says = |errno: i32| {
+            let again = Err(io::Error::from_raw_os_error(errno));
+            not_opened(Path::new("/dev/hidraw7"), ids, again, "it says no".to_owned()).to_string()
+        };
+        let [not_permitted, access, no_device] = [1, 13, 19].map(says);
+        assert!(not_permitted.contains("/dev/hidraw7 does not open: the service's unit"), "{not_permitted}");
+        assert!(access.contains("permission denied; as root write this line"), "{access}");
+        assert!(no_device.contains("does not open: it says no"), "{no_device}");
     }
 }

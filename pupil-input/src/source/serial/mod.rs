@@ -10,6 +10,7 @@ use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use holod_calibration::{KEPT_BY_UNIT, unit_keeps};
 use serialport::{ClearBuffer, SerialPort, TTYPort};
 
 use self::identity::{SerialPortInfo, UsbPort, ports_below, serial_ports};
@@ -322,15 +323,21 @@ impl OpenPort {
     fn new(path: &Path, baud: u32) -> Result<Self, SerialError> {
         let builder = serialport::new(path.to_string_lossy(), baud).timeout(READ_TIMEOUT);
         TTYPort::open(&builder).map(Self).map_err(|error| {
-            let hint = match error.kind() {
-                serialport::ErrorKind::NoDevice => "is another program using it? close that one first",
-                serialport::ErrorKind::Io(ErrorKind::PermissionDenied) => {
-                    "add the user to the port's group (often `dialout`) and log in again"
-                }
-                _ => "check the path, the cable and the tracker's power",
-            };
+            let hint = hint(error.kind(), || unit_keeps(path));
             SerialError::Open { path: path.into(), reason: error.to_string(), hint }
         })
+    }
+}
+
+/// What to do about a port that does not open; `unit_keeps` says whether the service's unit does not allow it.
+fn hint(found: serialport::ErrorKind, unit_keeps: impl FnOnce() -> bool) -> &'static str {
+    match found {
+        serialport::ErrorKind::NoDevice => "is another program using it? close that one first",
+        serialport::ErrorKind::Io(ErrorKind::PermissionDenied) if unit_keeps() => KEPT_BY_UNIT,
+        serialport::ErrorKind::Io(ErrorKind::PermissionDenied) => {
+            "add the user to the port's group (often `dialout`) and log in again"
+        }
+        _ => "check the path, the cable and the tracker's power",
     }
 }
 
@@ -398,6 +405,8 @@ fn ports_in_words(root: &Path) -> String {
 mod tests {
     use std::io::Read;
 
+    use holod_calibration::is_kept_by_unit;
+
     use super::identity::fake::FakeSystem;
     use super::*;
     use crate::SampleEye;
@@ -411,6 +420,17 @@ mod tests {
         let (tracker, port) = TTYPort::pair().expect("a PTY");
         let node = port.name().expect("a path").into();
         (tracker, port, node)
+    }
+
+    #[test]
+    fn a_port_that_the_unit_keeps_is_told_from_one_of_another_group() {
+        let says = |errno: i32| {
+            let error = io::Error::from_raw_os_error(errno);
+            hint(serialport::ErrorKind::Io(error.kind()), || is_kept_by_unit(&error))
+        };
+        let [not_permitted, access, no_entry] = [1, 13, 2].map(says);
+        assert!(not_permitted.contains("`holod unit`") && access.contains("`dialout`"), "{not_permitted}; {access}");
+        assert!(no_entry.contains("the cable"), "{no_entry}");
     }
 
     fn feed(system: &FakeSystem, path: &Path, profile: Profile, forbidden: &[PathBuf]) -> SerialFeed {

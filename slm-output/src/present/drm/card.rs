@@ -14,7 +14,7 @@ use drm::control::{
     property,
 };
 use drm::{ClientCapability, Device, DriverCapability, VblankWaitFlags, VblankWaitTarget};
-use holod_calibration::Resolution;
+use holod_calibration::{Resolution, is_kept_by_unit};
 use memmap2::{MmapMut, MmapOptions};
 use rustix::fs::OFlags;
 use rustix::io::Errno;
@@ -58,7 +58,7 @@ impl Card {
         if let Ok(driver) = card.get_driver() {
             card.driver = driver.name().to_string_lossy().into_owned();
         }
-        card.become_master().map_err(|_| DrmError::OtherMaster { card: path.to_owned(), who: users_of(path) })?;
+        card.become_master(users_of)?;
         for (capability, lacks) in [
             (ClientCapability::UniversalPlanes, "universal planes"),
             (ClientCapability::Atomic, "atomic mode setting (nvidia-drm needs `modeset=1`)"),
@@ -88,15 +88,17 @@ impl Card {
 
     /// Who opens a card that has no master is its master; after mastership was lost it must be asked for. Of a card
     /// that a seat has opened its manager makes the file master when it opens it and when the session comes to the
-    /// front; then it can only be seen whether it did.
-    pub(crate) fn become_master(&self) -> io::Result<()> {
-        if self.lease.is_none() {
-            return self.acquire_master_lock();
-        }
-        // Only a master may be asked to vouch for another client; nobody has the number 0.
-        match drm_ffi::auth::auth_magic_token(self.as_fd(), 0) {
-            Err(why) if why.kind() == ErrorKind::PermissionDenied => Err(why),
-            _ => Ok(()),
+    /// front; then it can only be seen whether it did. `users` tells who else has the card open.
+    pub(crate) fn become_master(&self, users: impl FnOnce(&Path) -> Vec<String>) -> Result<(), DrmError> {
+        let answer = match self.lease {
+            None => self.acquire_master_lock(),
+            // Only a master may be asked to vouch for another client; nobody has the number 0.
+            Some(_) => drm_ffi::auth::auth_magic_token(self.as_fd(), 0).map(drop),
+        };
+        match mastership(answer, self.lease.is_some()) {
+            Mastership::Ours => Ok(()),
+            Mastership::OfAnother => Err(DrmError::OtherMaster { card: self.path.clone(), who: users(&self.path) }),
+            Mastership::Refused(why) => Err(self.refused("becoming its master")(why)),
         }
     }
 
@@ -127,12 +129,38 @@ impl Card {
     }
 }
 
+/// What came of asking to be a card's master.
+#[derive(Debug)]
+enum Mastership {
+    Ours,
+    OfAnother,
+    /// For another reason, such as that the card is gone.
+    Refused(io::Error),
+}
+
+/// What the kernel's `answer` says of mastership: to a client that asked for it, or to one that a seat has opened and
+/// that asked for the client with the number 0.
+fn mastership(answer: io::Result<()>, of_seat: bool) -> Mastership {
+    let Err(why) = answer else { return Mastership::Ours };
+    match Errno::from_io_error(&why) {
+        // A master hears that there is no such client.
+        Some(Errno::INVAL) if of_seat => Mastership::Ours,
+        Some(Errno::BUSY | Errno::ACCESS | Errno::PERM | Errno::INVAL) => Mastership::OfAnother,
+        _ => Mastership::Refused(why),
+    }
+}
+
 fn open_file(path: &Path) -> Result<File, DrmError> {
     let flags = (OFlags::NONBLOCK | OFlags::CLOEXEC).bits() as i32;
-    OpenOptions::new().read(true).write(true).custom_flags(flags).open(path).map_err(|source| match source.kind() {
+    OpenOptions::new().read(true).write(true).custom_flags(flags).open(path).map_err(|source| not_opened(path, source))
+}
+
+fn not_opened(path: &Path, source: io::Error) -> DrmError {
+    match source.kind() {
+        ErrorKind::PermissionDenied if is_kept_by_unit(&source) => DrmError::NotAllowed { card: path.to_owned() },
         ErrorKind::PermissionDenied => permission(path),
         _ => DrmError::Refused { what: "opening", card: path.to_owned(), source },
-    })
+    }
 }
 
 /// Who may open `path` instead.
@@ -381,6 +409,30 @@ fn uninterrupted<T>(mut call: impl FnMut() -> io::Result<T>) -> io::Result<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_card_that_the_unit_keeps_is_told_from_one_of_another_group() {
+        let says = |errno: Errno| not_opened(Path::new("/dev/dri/card7"), errno.into()).to_string();
+        assert!(says(Errno::PERM).contains("/dev/dri/card7 does not open: the service's unit does not allow"));
+        assert!(says(Errno::ACCESS).contains("permission denied. It belongs to group"));
+        assert!(says(Errno::NODEV).contains("opening on /dev/dri/card7"));
+    }
+
+    #[test]
+    fn another_master_is_told_from_a_card_that_is_gone() {
+        let answered = |errno: Errno, of_seat| mastership(Err(errno.into()), of_seat);
+        for of_seat in [false, true] {
+            assert!(matches!(mastership(Ok(()), of_seat), Mastership::Ours));
+            for errno in [Errno::BUSY, Errno::ACCESS, Errno::PERM] {
+                assert!(matches!(answered(errno, of_seat), Mastership::OfAnother), "{errno}");
+            }
+            for errno in [Errno::NODEV, Errno::NXIO, Errno::IO] {
+                assert!(matches!(answered(errno, of_seat), Mastership::Refused(_)), "{errno}");
+            }
+        }
+        assert!(matches!(answered(Errno::INVAL, false), Mastership::OfAnother), "a lessee");
+        assert!(matches!(answered(Errno::INVAL, true), Mastership::Ours), "no client has the number 0");
+    }
 
     #[test]
     fn a_call_that_is_interrupted_is_made_again_and_a_refusal_is_handed_on() {

@@ -3,7 +3,7 @@
 use std::io;
 use std::path::PathBuf;
 
-use holod_calibration::Resolution;
+use holod_calibration::{KEPT_BY_UNIT, Resolution};
 
 use super::check::DisplayCheck;
 use super::find::ConnectorList;
@@ -57,6 +57,9 @@ pub enum DrmError {
         /// Its name in the kernel.
         kernel: String,
     },
+    /// The card's node may not be opened whatever its mode is.
+    #[error("{card} does not open: {KEPT_BY_UNIT}")]
+    NotAllowed { card: PathBuf },
     /// The seat's manager does not open the card: its node is gone, or it belongs to another seat.
     #[error("the seat's manager does not open {card}: {source}")]
     NotOfSeat { card: PathBuf, source: io::Error },

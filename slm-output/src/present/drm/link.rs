@@ -16,6 +16,7 @@ use super::event::{Uevent, for_each_flip};
 use super::find::{NotFound, SYS_CLASS_DRM, SeenConnector, choose, seen_connectors};
 use super::hotplug::Hotplug;
 use super::mode;
+use super::monitor::Monitor;
 use super::seat::Seat;
 use super::settings::{self, Change, LinkStatus};
 use super::timing::FlipStamp;
@@ -25,6 +26,9 @@ use super::timing::FlipStamp;
 pub(crate) const BUFFERS: usize = 4;
 /// Events that are read at once; one flip is under way at a time.
 const EVENTS_MAX: usize = 32;
+
+/// How often a connector's properties are read that change meanwhile.
+const READINGS: usize = 3;
 
 /// What is wanted of a connector.
 #[derive(Clone, Debug)]
@@ -49,6 +53,7 @@ pub(crate) struct Link {
     mode: Mode,
     buffer_property: property::Handle,
     link_status: Option<LinkStatus>,
+    monitor: Option<Monitor>,
     /// The connector's properties and their values when it was last asked; their memory is taken when it is opened.
     connector_says: (Vec<u32>, Vec<u64>),
     pub(crate) buffers: [ScanBuffer; BUFFERS],
@@ -76,7 +81,7 @@ impl Link {
         let wake = wake_fd(&card, hotplug.as_ref(), seat).map_err(|why| card.refused("waiting for it")(why.into()))?;
         let node = seen.card.file_name().map(|name| name.as_encoded_bytes().to_vec()).unwrap_or_default();
         let ready = Ready::make(&card, &seen, wanted, &buffers[0])?;
-        let Ready { pipe, mode, buffer_property, link_status, changes, mut checks } = ready;
+        let Ready { pipe, mode, buffer_property, link_status, monitor, changes, mut checks } = ready;
         checks.push(match hotplug {
             Some(_) => DisplayCheck::equal("hotplug messages", "heard", "heard"),
             None => DisplayCheck::unverified("hotplug messages", "the kernel's socket does not open", "heard"),
@@ -90,6 +95,7 @@ impl Link {
             mode,
             buffer_property,
             link_status,
+            monitor,
             connector_says,
             buffers,
             changes,
@@ -98,16 +104,14 @@ impl Link {
             wake,
         };
         // What it says by now, `checks` have; this takes the memory that later answers go to.
-        link.is_good().map_err(|why| link.card.refused("reading its connector")(why.into()))?;
+        link.found().map_err(|why| link.card.refused("reading its connector")(why.into()))?;
         Ok(link)
     }
 
     /// Makes the connector ready again after mastership or the monitor had been lost; like [`Link::open`], but the card
     /// stays open, so that nobody else becomes its master meanwhile.
     pub(crate) fn reopen(&mut self, wanted: &Wanted, write_flat: impl Fn(&mut ScanBuffer)) -> Result<(), DrmError> {
-        self.card
-            .become_master()
-            .map_err(|_| DrmError::OtherMaster { card: self.card.path().to_owned(), who: Vec::new() })?;
+        self.card.become_master(|_| Vec::new())?;
         // The kernel forgets what it knew of a monitor only when it is asked for it.
         let asked = self.card.is_connected(self.pipe.connector);
         if !asked.map_err(self.card.refused("asking the monitor"))? {
@@ -121,7 +125,7 @@ impl Link {
         let ready = Ready::make(&self.card, &seen, wanted, &self.buffers[0])?;
         let hotplug = self.checks.pop();
         (self.seen, self.pipe, self.mode, self.buffer_property) = (seen, ready.pipe, ready.mode, ready.buffer_property);
-        self.link_status = ready.link_status;
+        (self.link_status, self.monitor) = (ready.link_status, ready.monitor);
         self.checks = ready.checks;
         self.checks.extend(hotplug);
         Ok(())
@@ -172,9 +176,19 @@ impl Link {
         self.card.is_connected(connector).map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))
     }
 
-    /// Whether the driver still calls the link to the monitor good, as far as it says.
-    pub(crate) fn is_good(&mut self) -> Result<bool, Errno> {
-        let Some(status) = self.link_status else { return Ok(true) };
+    /// What the driver says of the connected monitor and the link to it. Takes no memory.
+    pub(crate) fn found(&mut self) -> Result<Found, Errno> {
+        for _ in 1..READINGS {
+            match self.read_found() {
+                // Somebody else had the EDID read anew meanwhile.
+                Err(Errno::NOENT) => {}
+                found => return found,
+            }
+        }
+        self.read_found()
+    }
+
+    fn read_found(&mut self) -> Result<Found, Errno> {
         let (properties, values) = &mut self.connector_says;
         drm_ffi::mode::get_properties(
             self.card.as_fd(),
@@ -184,7 +198,19 @@ impl Link {
             Some(values),
         )
         .map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))?;
-        Ok(status.is_good(properties.iter().copied().zip(values.iter().copied())))
+        let said = properties.iter().copied().zip(values.iter().copied());
+        let card = &self.card;
+        let read = |blob: u64, bytes: &mut Vec<u8>| {
+            let read = drm_ffi::mode::get_property_blob(card.as_fd(), blob as u32, Some(bytes));
+            read.map(drop).map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))
+        };
+        if let Some(monitor) = &mut self.monitor
+            && !monitor.is_same(said.clone(), read)?
+        {
+            return Ok(Found::OtherMonitor);
+        }
+        let is_good = self.link_status.is_none_or(|status| status.is_good(said));
+        Ok(if is_good { Found::Good } else { Found::BadLink })
     }
 
     /// The stamps of the connector's flips since the last call, in order. Takes no memory.
@@ -212,6 +238,15 @@ impl Drop for Link {
     fn drop(&mut self) {
         settings::restore(&self.card, &self.changes);
     }
+}
+
+/// A connected monitor and the link to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Found {
+    /// As they were, as far as the driver says.
+    Good,
+    BadLink,
+    OtherMonitor,
 }
 
 /// Stamps of flips.
@@ -258,6 +293,7 @@ struct Ready {
     mode: Mode,
     buffer_property: property::Handle,
     link_status: Option<LinkStatus>,
+    monitor: Option<Monitor>,
     changes: Vec<Change>,
     checks: Vec<DisplayCheck>,
 }
@@ -296,7 +332,8 @@ impl Ready {
         let _ = card.destroy_property_blob(blob);
         set.map_err(card.refused("setting the mode"))?;
         let link_status = LinkStatus::of(&before.connector);
-        let mut ready = Self { pipe, mode, buffer_property, link_status, changes, checks: Vec::new() };
+        let monitor = Monitor::of(card, &before.connector);
+        let mut ready = Self { pipe, mode, buffer_property, link_status, monitor, changes, checks: Vec::new() };
         ready.checks = ready.read_back(card, seen, wanted)?;
         let wrong: Vec<_> = ready.checks.iter().filter(|check| check.verdict == Verdict::Wrong).cloned().collect();
         if !wrong.is_empty() {

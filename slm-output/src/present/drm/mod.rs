@@ -18,6 +18,7 @@ mod hotplug;
 mod link;
 mod margin;
 mod mode;
+mod monitor;
 mod properties;
 #[cfg(feature = "seat")]
 mod seat;
@@ -45,7 +46,7 @@ use crate::fields::{FrameTag, LevelsFrame};
 use crate::packing::{PixelFormat, write_frame};
 use card::ScanBuffer;
 use event::Uevent;
-use link::{BUFFERS, Link, Wanted};
+use link::{BUFFERS, Found, Link, Wanted};
 use seat::{Seat, Standing};
 
 /// A flip that has not come after this time never will.
@@ -175,8 +176,10 @@ impl DrmPanel {
             Uevent::Changed if !self.link()?.is_connected().map_err(fault_of)? => return Err(PanelFault::Unplugged),
             Uevent::Changed => {
                 let link = self.link.as_mut().ok_or(PanelFault::DeviceLost)?;
-                if !link.is_good().map_err(fault_of)? {
-                    return Err(PanelFault::LinkBad);
+                match link.found().map_err(fault_of)? {
+                    Found::Good => {}
+                    Found::BadLink => return Err(PanelFault::LinkBad),
+                    Found::OtherMonitor => return Err(PanelFault::Unplugged),
                 }
             }
             Uevent::Other => {}
@@ -357,6 +360,10 @@ impl Presenter for DrmPanel {
 
     fn recover(&mut self, now: TimeNs) -> Result<(), PanelFault> {
         self.follow_seat()?;
+        // What was said meanwhile: a card that went away does not come back, though another may have its node by now.
+        if self.link.as_ref().is_some_and(|link| link.hotplug() == Uevent::Removed) {
+            self.lost = Some(PanelFault::DeviceLost);
+        }
         if let Err(why) = self.take_back() {
             let fault = why.fault();
             // What is gone is opened anew from now on; and so is what another program is master of where only the
@@ -420,9 +427,11 @@ impl DrmError {
             Self::OtherMaster { .. } => PanelFault::MastershipLost,
             Self::Disconnected { .. } | Self::NoSuchConnector { .. } | Self::Ambiguous { .. } => PanelFault::Unplugged,
             Self::OtherSize { .. } | Self::NoSuchMode { .. } | Self::NotAsSent { .. } => PanelFault::ModeRefused,
-            Self::NoCard { .. } | Self::Permission { .. } | Self::NotOfSeat { .. } | Self::Unsupported { .. } => {
-                PanelFault::DeviceLost
-            }
+            Self::NoCard { .. }
+            | Self::Permission { .. }
+            | Self::NotAllowed { .. }
+            | Self::NotOfSeat { .. }
+            | Self::Unsupported { .. } => PanelFault::DeviceLost,
             Self::Refused { source, .. } => match Errno::from_io_error(source).map(fault_of) {
                 Some(fault) if fault.is_recoverable() => fault,
                 _ => PanelFault::DeviceLost,
