@@ -15,7 +15,7 @@ use holod_pupil_input::host_now;
 use holod_tests::daemon::{Daemon, run, wait_until};
 use rustix::process::Signal;
 use tokio::runtime::Runtime;
-use zbus::{Connection, connection, interface, zvariant};
+use zbus::{Connection, connection, fdo, interface, zvariant};
 
 use crate::HOLOD;
 use crate::shutdown::LaserBench;
@@ -72,12 +72,16 @@ struct Inhibitor {
 #[derive(Clone, Default)]
 struct Known {
     prepares: Arc<AtomicBool>,
+    refuses: Arc<AtomicBool>,
     inhibitors: Arc<Mutex<Vec<Inhibitor>>>,
 }
 
 #[interface(name = "org.freedesktop.login1.Manager")]
 impl Known {
-    fn inhibit(&self, what: String, who: String, why: String, mode: String) -> zvariant::OwnedFd {
+    fn inhibit(&self, what: String, who: String, why: String, mode: String) -> fdo::Result<zvariant::OwnedFd> {
+        if self.refuses.load(Ordering::Acquire) {
+            return Err(fdo::Error::AccessDenied("Permission denied".into()));
+        }
         assert!(who == "holod" && !why.is_empty(), "{who}: {why}");
         let (mut reader, writer) = std::io::pipe().unwrap();
         let mut inhibitors = self.inhibitors.lock().unwrap();
@@ -88,7 +92,7 @@ impl Known {
             let _end = reader.read(&mut [0]);
             all.lock().unwrap()[index].t_released = Some(host_now());
         });
-        OwnedFd::from(writer).into()
+        Ok(OwnedFd::from(writer).into())
     }
 
     #[zbus(property)]
@@ -244,4 +248,24 @@ fn lasers_over_a_pattern_are_dark_before_the_machine_sleeps() {
     daemon.signal(Signal::TERM);
     let ended = daemon.wait(Duration::from_secs(20));
     assert!(ended.status.success(), "{}", ended.stderr);
+}
+
+#[test]
+fn lasers_are_put_out_also_where_logind_does_not_wait_for_them() {
+    let laser_box = LaserBench::plug_in();
+    let bus = Bus::start(laser_box.folder.path());
+    let logind = Logind::start(&bus);
+    logind.known.refuses.store(true, Ordering::Release);
+    let daemon = laser_box.lit_daemon_with(&[("DBUS_SYSTEM_BUS_ADDRESS", &bus.address)]);
+    logind.prepare(true);
+    thread::sleep(Duration::from_secs(1));
+    let lit_before = laser_box.edges().len();
+    thread::sleep(Duration::from_millis(500));
+    assert_eq!(laser_box.edges().len(), lit_before);
+    logind.prepare(false);
+    assert!(are_lit_again(&laser_box));
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(Duration::from_secs(20));
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert!(!ended.stderr.contains("logind"), "the box has a heartbeat: {}", ended.stderr);
 }
