@@ -11,7 +11,7 @@ use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::Duration;
 
-use holod_tests::daemon::{Daemon, Ended, run, wait_until};
+use holod_tests::daemon::{Daemon, Ended, NO_BUS, run, wait_until};
 use holod_tests::feed::FeedClient;
 use holod_tests::tracker::PtyTracker;
 use holod_tests::{frames, small_rig};
@@ -47,7 +47,8 @@ fn by_shell(folder: &Path, before: &str, more: &[&str], redirects: &str) -> Comm
     let words: Vec<_> = [&[HOLOD][..], &ARGS, more].concat().iter().map(|word| format!("'{word}'")).collect();
     let mut command = Command::new("sh");
     command.args(["-c", &format!("{before} exec {} {redirects}", words.join(" "))]);
-    command.current_dir(folder).env("XDG_RUNTIME_DIR", folder).stdin(Stdio::null());
+    command.current_dir(folder).env("XDG_RUNTIME_DIR", folder).env("DBUS_SYSTEM_BUS_ADDRESS", NO_BUS);
+    command.stdin(Stdio::null());
     command
 }
 

@@ -17,6 +17,7 @@ mod record;
 mod render;
 mod report;
 mod shutdown;
+mod sleep;
 mod tracker;
 
 const HOLOD: &str = env!("CARGO_BIN_EXE_holod");

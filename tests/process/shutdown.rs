@@ -12,7 +12,7 @@ use holod_pupil_input::host_now;
 use holod_slm_output::laser::edge_log::read_log;
 use holod_slm_output::laser::simulator::{Faults, SimulatedBox, SimulatedTerminal};
 use holod_slm_output::laser::{BoxEvent, DarkReason, LaserEdge};
-use holod_tests::daemon::{Daemon, run, wait_until};
+use holod_tests::daemon::{Daemon, NO_BUS, run, wait_until};
 use holod_tests::tracker::PtyTracker;
 use holod_tests::{FIELD_ORDER, frames, small_rig};
 use rustix::process::Signal;
@@ -21,14 +21,14 @@ use crate::HOLOD;
 
 /// A laser box on a pseudo-terminal, outside the daemon's process, with a clock of its own, that logs what its lasers
 /// do.
-struct LaserBench {
-    folder: tempfile::TempDir,
+pub(crate) struct LaserBench {
+    pub(crate) folder: tempfile::TempDir,
     device: PathBuf,
     faults: Arc<Faults>,
 }
 
 impl LaserBench {
-    fn plug_in() -> Self {
+    pub(crate) fn plug_in() -> Self {
         let folder = holod_tests::new_folder();
         let device = folder.path().join("lasers");
         let rig = small_rig(64, 64, &format!("driver = \"serial\"\ndevice = {device:?}"));
@@ -61,15 +61,20 @@ impl LaserBench {
         read_log(&fs::read_to_string(self.folder.path().join("box.csv")).unwrap()).unwrap()
     }
 
-    fn edges(&self) -> Vec<LaserEdge> {
+    pub(crate) fn edges(&self) -> Vec<LaserEdge> {
         let edge = |event| if let BoxEvent::Edge(edge) = event { Some(edge) } else { None };
         self.events().into_iter().filter_map(edge).collect()
     }
 
     /// Starts the daemon and waits until its lasers have been lit for a while.
     fn lit_daemon(&self) -> Daemon {
+        self.lit_daemon_with(&[])
+    }
+
+    /// The same with additional variables in its environment.
+    pub(crate) fn lit_daemon_with(&self, environment: &[(&str, &Path)]) -> Daemon {
         let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64", "--record", "record"];
-        let daemon = Daemon::start(HOLOD, &args, self.folder.path());
+        let daemon = Daemon::start_with(HOLOD, &args, self.folder.path(), environment);
         let lit = wait_until(Duration::from_secs(30), || self.edges().len() > 60);
         assert!(lit, "the lasers are lit while the daemon runs: {:?}", self.events().last());
         daemon
@@ -117,7 +122,7 @@ impl LaserBench {
         assert!(succeeds && said.contains("they are left as they are"), "{said}");
     }
 
-    fn assert_dark(&self) {
+    pub(crate) fn assert_dark(&self) {
         let edges = self.edges();
         for pair in edges.chunks(2) {
             let [on, off] = pair else { panic!("a laser is still lit: {:?}", edges.last()) };
@@ -164,6 +169,7 @@ fn signals_end_in_order_with_lasers_dark_and_a_flat_panel() {
         daemon.signal(signal);
         let ended = daemon.wait(Duration::from_secs(20));
         assert!(ended.status.success(), "{}", ended.stderr);
+        assert!(!ended.stderr.contains("sleep"), "that no bus is there is no fault: {}", ended.stderr);
         let last = laser_box.events().last().copied();
         // On a machine that is busy with other work they may have gone dark for another reason just before.
         assert!(matches!(last, Some(BoxEvent::Dark { .. })), "{last:?}");
@@ -534,6 +540,7 @@ fn a_second_signal_does_not_leave_lasers_without_a_heartbeat_lit() {
     assert!(heard.lock().unwrap()[before..].iter().any(|words| words == "l0"), "{:?}", heard.lock().unwrap());
     assert!(ended.stderr.contains("a second signal ends holod only once"), "{}", ended.stderr);
     assert!(ended.stderr.contains("SIGTSTP (Ctrl-Z) is not obeyed"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("may stay lit while the machine sleeps"), "no bus is there: {}", ended.stderr);
 }
 
 fn judge_record(record: &Path) {
@@ -557,6 +564,7 @@ fn the_watchdog_is_fed_and_readiness_told_only_once_frames_are_shown() {
         .args(["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64", "--duration", "3s"])
         .current_dir(folder.path())
         .env("NOTIFY_SOCKET", &socket)
+        .env("DBUS_SYSTEM_BUS_ADDRESS", NO_BUS)
         .env("WATCHDOG_USEC", "400000")
         .stdout(std::process::Stdio::null())
         .stderr(std::process::Stdio::null())

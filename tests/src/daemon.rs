@@ -8,6 +8,9 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 
+/// The address of a system bus that is not there: tests ask nothing of the machine's own logind.
+pub const NO_BUS: &str = "unix:path=/nowhere/system_bus_socket";
+
 /// A running `holod`; killed when it is dropped.
 pub struct Daemon {
     child: Child,
@@ -46,6 +49,7 @@ impl Daemon {
             .env("XDG_RUNTIME_DIR", folder)
             .env("TMPDIR", folder)
             .env("HOLOD_DARK_NOTES", folder)
+            .env("DBUS_SYSTEM_BUS_ADDRESS", NO_BUS)
             .env_remove("RUNTIME_DIRECTORY")
             .envs(environment.iter().copied())
             .current_dir(folder)

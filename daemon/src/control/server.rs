@@ -1,5 +1,5 @@
-//! The control socket. tokio lives here and nowhere else, with one thread of its own and one for what takes long; no
-//! real-time thread waits for either.
+//! The control socket, in tokio, with one thread of its own and one for what takes long; no real-time thread waits for
+//! either.
 
 use std::cell::Cell;
 use std::collections::BTreeMap;

@@ -26,6 +26,7 @@ use super::plan::SessionPlan;
 use super::recorded_levels::KEEP_SLOTS;
 use super::scheduling;
 use super::service::{Service, Signals};
+use super::sleep::SleepWatch;
 use super::stats::FrameRate;
 use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
@@ -261,6 +262,7 @@ pub(super) fn build(
         feed_watch: FeedWatch::new(dark_after, t_origin),
         record: plan.record,
         desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }, &found),
+        sleep: SleepWatch::begin(&rig.lasers.driver),
         signals,
         hangups: plan.hangups,
         service,

@@ -16,6 +16,7 @@ mod rate_watch;
 mod recorded_levels;
 pub(crate) mod scheduling;
 mod service;
+mod sleep;
 mod stats;
 mod summary;
 mod take_down;
@@ -32,6 +33,7 @@ pub use self::observer::{Began, FirstLight, Observer};
 pub use self::plan::SessionPlan;
 pub use self::service::Hangups;
 pub(crate) use self::service::Signals;
+pub(crate) use self::sleep::SleepWatch;
 pub use self::summary::{SessionReport, Summary};
 pub use self::take_down::{NO_ACKNOWLEDGEMENT, PANEL_HANGS, not_dark};
 

@@ -210,6 +210,9 @@ impl Watch<'_> {
             format!("; a holod that is started anew keeps them dark all the same: {stays}")
         });
         output.keep_dark(self.dark_wish());
+        if self.sleep.keeps_dark().is_some() {
+            return format!("lasers are lit again by the rules, once the machine has slept{stays}").into();
+        }
         if self.feed_watch.keeps_dark() {
             return format!("lasers are lit again by the rules, once the live feed gives a picture{stays}").into();
         }

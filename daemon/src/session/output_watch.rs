@@ -299,7 +299,9 @@ mod tests {
 
     #[test]
     fn darkness_that_was_asked_for_is_no_trouble() {
-        for reason in [DarkReason::Asked, DarkReason::NoPicture, DarkReason::ByHand, DarkReason::Stall] {
+        for reason in
+            [DarkReason::Asked, DarkReason::NoPicture, DarkReason::Sleep, DarkReason::ByHand, DarkReason::Stall]
+        {
             let mut watch = watch();
             assert_eq!(said(&mut watch, 0, |_| Some(reason)), [""; 0]);
             assert_eq!(watch.unlit(), None);

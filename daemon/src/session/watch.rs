@@ -22,6 +22,7 @@ use super::observer::Observer;
 use super::output_watch::OutputWatch;
 use super::rate_watch::RateWatch;
 use super::service::{Hangups, Service, Signals};
+use super::sleep::SleepWatch;
 use super::stats::FrameRate;
 use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
@@ -58,6 +59,7 @@ pub(super) struct Watch<'a> {
     pub(super) feed_watch: FeedWatch,
     pub(super) record: Option<Arc<RecordHealth>>,
     pub(super) desk: Desk,
+    pub(super) sleep: SleepWatch,
     pub(super) signals: Signals,
     pub(super) hangups: Option<Hangups>,
     pub(super) service: Service,
@@ -179,6 +181,7 @@ impl Watch<'_> {
                 return Ok("holod ctl stop".to_owned());
             }
             self.judge_feed(output, now);
+            self.judge_sleep(output);
             if self.hangups.as_ref().is_some_and(Hangups::asked) {
                 self.desk.reload();
             }
@@ -253,10 +256,19 @@ impl Watch<'_> {
         self.write_status(&output.counts(), now);
     }
 
+    /// Puts the lasers out before the machine sleeps, and lets them be lit once it is awake.
+    fn judge_sleep(&mut self, output: &OutputControl) {
+        self.sleep.may_be_lit(self.dark_wish().is_none());
+        if self.sleep.look() {
+            let wish = self.dark_wish();
+            self.sleep.told(wish, output.keep_dark(wish));
+        }
+    }
+
     /// Why lasers are to be kept dark, where they are: what a person asks for comes first.
     pub(super) fn dark_wish(&self) -> Option<DarkReason> {
         let feed = self.feed_watch.keeps_dark().then_some(DarkReason::NoPicture);
-        self.desk.keeps_dark().then_some(DarkReason::Asked).or(feed)
+        self.desk.keeps_dark().then_some(DarkReason::Asked).or(self.sleep.keeps_dark()).or(feed)
     }
 
     /// Why the feed keeps lasers dark, where it does.

@@ -214,6 +214,7 @@ dark_reasons! {
     PanelLost, "panel-lost", "the panel is gone";
     Balance, "balance", "another colour has been lit for less time";
     NoPicture, "no-picture", "the live feed has given no new picture for the time of --feed-dark-after";
+    Sleep, "sleep", "the machine is about to sleep, or has just woken";
     Unattended, "unattended", "holod's control thread stood still for 5 s and obeyed no signal meanwhile; where it still does, end holod with SIGKILL";
     Shutdown, "shutdown", "an orderly end";
     Panic, "panic", "a thread of holod failed";

@@ -13,7 +13,7 @@ use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, Pa
 
 use crate::cli::PatternTarget;
 use crate::failure::{Exit, Failure};
-use crate::session::{LaserBoxWatch, NO_ACKNOWLEDGEMENT, PANEL_HANGS, Signals, not_dark};
+use crate::session::{LaserBoxWatch, NO_ACKNOWLEDGEMENT, PANEL_HANGS, Signals, SleepWatch, not_dark};
 
 /// Time that a frame may take before it has been measured.
 const FIRST_COPY: TimeNs = TimeNs(5_000_000);
@@ -59,6 +59,8 @@ pub(super) fn show(
             "lasers will be lit: an eye in the display may get all of their light in one spot; use a camera"
         );
     }
+    let mut sleep = SleepWatch::begin(&rig.lasers.driver);
+    sleep.may_be_lit(!to.dark);
     let planes = Colour::ALL.map(|colour| levels.unpack_colour(colour).levels);
     let t_begin = host_now();
     let duration = to.duration.map(|duration| TimeNs(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)));
@@ -69,6 +71,10 @@ pub(super) fn show(
         loop {
             let now = host_now();
             signals.tell_of_suspension();
+            if sleep.look() {
+                let wish = to.dark.then_some(DarkReason::Asked).or(sleep.keeps_dark());
+                sleep.told(wish, output.control.keep_dark(wish));
+            }
             if let Some(signal) = signals.caught() {
                 break 'frames Ok(signal.to_owned());
             }
