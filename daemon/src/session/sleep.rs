@@ -26,6 +26,8 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// How long a bus that is not there is left alone.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 const ANSWER_WITHIN: Duration = Duration::from_secs(5);
+/// logind's property.
+const PREPARING: &str = "PreparingForSleep";
 
 /// The control thread's view of the machine's sleep.
 pub(crate) struct SleepWatch {
@@ -276,8 +278,6 @@ impl Listener {
 fn failure(why: &str) -> zbus::Error {
     zbus::Error::Failure(why.to_owned())
 }
-
-const PREPARING: &str = "PreparingForSleep";
 
 /// While this is held logind does not do to an idle machine what its `IdleAction` says.
 async fn keep_from_idle_sleep(logind: &Proxy<'_>) -> Option<OwnedFd> {
