@@ -13,8 +13,6 @@ const EDID_BYTES_MAX: usize = 256 * 128;
 #[derive(Debug)]
 pub(crate) struct Monitor {
     property: property::Handle,
-    /// The number that the kernel has for the EDID: another one each time that it reads it, whatever it reads.
-    blob: u64,
     edid: Vec<u8>,
     /// Memory for another one.
     now: Vec<u8>,
@@ -25,11 +23,12 @@ impl Monitor {
     pub(crate) fn of(card: &Card, properties: &Properties) -> Option<Self> {
         let (info, blob) = properties.find("EDID")?;
         let edid = if *blob == 0 { Some(Vec::new()) } else { card.get_property_blob(*blob).ok() }?;
-        Some(Self { property: info.handle(), blob: *blob, edid, now: Vec::with_capacity(EDID_BYTES_MAX) })
+        Some(Self { property: info.handle(), edid, now: Vec::with_capacity(EDID_BYTES_MAX) })
     }
 
     /// Whether the connector's `values` are of the same monitor, or say nothing of who it is; `read` reads what the kernel
-    /// has by a number. Takes no memory.
+    /// has by a number, which tells nothing by itself: one that was given up is given again, to another EDID. Takes no
+    /// memory.
     pub(crate) fn is_same(
         &mut self,
         values: impl IntoIterator<Item = (u32, u64)>,
@@ -37,13 +36,9 @@ impl Monitor {
     ) -> Result<bool, Errno> {
         let edid = u32::from(self.property);
         let blob = values.into_iter().find_map(|(property, value)| (property == edid).then_some(value));
-        let Some(blob) = blob.filter(|&blob| blob != 0 && blob != self.blob) else { return Ok(true) };
+        let Some(blob) = blob.filter(|&blob| blob != 0) else { return Ok(true) };
         read(blob, &mut self.now)?;
-        let is_same = self.now == self.edid;
-        if is_same {
-            self.blob = blob;
-        }
-        Ok(is_same)
+        Ok(self.now == self.edid)
     }
 }
 
@@ -55,9 +50,9 @@ mod tests {
 
     const EDID: u32 = 7;
 
-    fn monitor(blob: u64, edid: &[u8]) -> Monitor {
+    fn monitor(edid: &[u8]) -> Monitor {
         let property = drm::control::from_u32::<property::Handle>(EDID).unwrap();
-        Monitor { property, blob, edid: edid.to_vec(), now: Vec::with_capacity(EDID_BYTES_MAX) }
+        Monitor { property, edid: edid.to_vec(), now: Vec::with_capacity(EDID_BYTES_MAX) }
     }
 
     fn edid(serial: &str) -> Vec<u8> {
@@ -78,21 +73,19 @@ mod tests {
 
     #[test]
     fn another_monitor_is_told_from_the_same_one_that_was_read_anew() {
-        let mut seen = monitor(40, &edid("6001"));
+        let mut seen = monitor(&edid("6001"));
         assert_eq!(seen.is_same([(3, 41), (EDID, 41)], reads(edid("6001"))), Ok(true));
-        assert_eq!(seen.is_same([(EDID, 41)], unread), Ok(true), "it was compared already");
-        assert_eq!(seen.is_same([(EDID, 42)], reads(edid("6002"))), Ok(false));
-        assert_eq!(seen.is_same([(EDID, 42)], reads(edid("6002"))), Ok(false), "each time");
-        assert_eq!(seen.is_same([(EDID, 43)], unread), Err(Errno::NOENT));
-        assert_eq!(seen.is_same([(EDID, 44)], reads(edid("6001"))), Ok(true), "the first one again");
+        assert_eq!(seen.is_same([(EDID, 41)], reads(edid("6002"))), Ok(false), "by the same number");
+        assert_eq!(seen.is_same([(EDID, 42)], unread), Err(Errno::NOENT));
+        assert_eq!(seen.is_same([(EDID, 43)], reads(edid("6001"))), Ok(true), "the first one again");
     }
 
     #[test]
     fn a_monitor_that_does_not_say_who_it_is_is_no_other() {
-        let mut seen = monitor(40, &edid("6001"));
+        let mut seen = monitor(&edid("6001"));
         assert_eq!(seen.is_same([(EDID, 0)], unread), Ok(true));
         assert_eq!(seen.is_same([(3, 41)], unread), Ok(true));
-        let mut silent = monitor(0, &[]);
+        let mut silent = monitor(&[]);
         assert_eq!(silent.is_same([(EDID, 0)], unread), Ok(true));
         assert_eq!(silent.is_same([(EDID, 41)], reads(edid("6001"))), Ok(false));
     }
