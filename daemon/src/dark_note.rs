@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{ErrorKind, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
@@ -22,6 +22,9 @@ const SHARED_VARIABLE: &str = "HOLOD_DARK_NOTES";
 const SHARED: &str = "/var/lib/holod:/run/lock";
 /// Where links to ports are.
 const LINK_FOLDERS: [&str; 3] = ["/dev", "/dev/serial/by-id", "/dev/serial/by-path"];
+
+/// A note is read so far.
+const CONTENT_BYTES_MAX: u64 = 1 << 14;
 
 /// The notes on one rig's lasers. Simulated ones have none.
 ///
@@ -102,10 +105,15 @@ impl DarkNote {
         Self { ports, folders, looked_at, of_service }
     }
 
-    /// What is in each note, by what its name begins with, but for a `holod-` before it.
-    fn contents(&self) -> BTreeMap<String, String> {
-        let names = self.ports.iter().flat_map(|port| names_of(port, &self.folders.links));
-        names.map(|name| (stem(&[&name]), format!("{}\n", name.display()))).collect()
+    /// What is in each note, all names of its port, a line each, by what its name begins with, but for a `holod-` before it.
+    fn contents(&self) -> BTreeMap<String, Vec<u8>> {
+        let mut contents = BTreeMap::new();
+        for port in &self.ports {
+            let names = names_of(port, &self.folders.links);
+            let lines = names.iter().map(|name| line(name)).collect::<Vec<_>>().concat();
+            contents.extend(names.iter().map(|name| (stem(name), lines.clone())));
+        }
+        contents
     }
 
     /// Looks whether a holod before this one, or another user's, left one.
@@ -120,15 +128,28 @@ impl DarkNote {
 
     /// All notes on these lasers, and why folders cannot be read.
     fn notes(&self) -> (Vec<PathBuf>, Vec<String>) {
-        let mut stems: Vec<_> = self.contents().into_keys().collect();
-        // An older holod left one for all ports together.
-        let ports: Vec<_> = self.ports.iter().map(|port| whole(port)).collect();
-        stems.push(stem(&ports.iter().map(PathBuf::as_path).collect::<Vec<_>>()));
-        let is_on_these = |name: &String| stems.iter().any(|stem| is_named(name, stem));
+        let stems = self.contents();
+        let ports: Vec<_> = self.ports.iter().map(|port| line(&whole(port))).collect();
+        // One that lists a port as the rig names it is on that port, too, whatever links led there when it was left.
+        let lists_a_port = |note: &Path| {
+            let read = fs::File::open(note).and_then(|file| {
+                let mut content = Vec::new();
+                file.take(CONTENT_BYTES_MAX).read_to_end(&mut content).map(|_| content)
+            });
+            read.is_ok_and(|content| {
+                content.split_inclusive(|&byte| byte == b'\n').any(|at| ports.iter().any(|p| p == at))
+            })
+        };
+        let is_on_these = |folder: &Path, name: &str| {
+            is_note(name) && (stems.keys().any(|stem| is_named(name, stem)) || lists_a_port(&folder.join(name)))
+        };
         let (mut notes, mut unreadable) = (Vec::new(), Vec::new());
         for folder in &self.looked_at {
             match names(folder) {
-                Ok(names) => notes.extend(names.into_iter().filter(is_on_these).map(|name| folder.join(name))),
+                Ok(names) => {
+                    let on_these = names.into_iter().filter(|name| is_on_these(folder, name));
+                    notes.extend(on_these.map(|name| folder.join(name)));
+                }
                 Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {}
                 Err(error) => unreadable.push(format!("{}: {error}", folder.display())),
             }
@@ -190,9 +211,11 @@ impl DarkNote {
         if self.of_service {
             return;
         }
-        for stem in self.contents().keys() {
-            for folder in self.folders.own.iter().chain(&self.folders.shared) {
-                let _not_there = fs::remove_file(folder.join(self.own_name(stem)));
+        let own = format!("-{}", rustix::process::getuid().as_raw());
+        for note in self.notes().0 {
+            let name = note.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+            if name.ends_with(&own) && !name.contains("-service-") {
+                let _not_there = fs::remove_file(note);
             }
         }
     }
@@ -203,7 +226,10 @@ fn names_of(port: &Path, link_folders: &[PathBuf]) -> Vec<PathBuf> {
     let mut names = vec![whole(port)];
     let Ok(device) = port.canonicalize() else { return names };
     let entries = link_folders.iter().filter_map(|folder| fs::read_dir(folder).ok()).flatten().flatten();
+    // Others lead to files of this process, which may be on a disk that stands still.
+    let is_of_device = |link: &PathBuf| fs::read_link(link).is_ok_and(|target| !target.starts_with("/proc"));
     let links = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink())).map(|link| link.path());
+    let links = links.filter(is_of_device);
     names.extend(links.filter(|link| link.canonicalize().is_ok_and(|leads_to| leads_to == device)));
     names.push(device);
     names
@@ -213,10 +239,17 @@ fn whole(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
 }
 
-/// What the name of a note on `ports` begins with.
-fn stem(ports: &[&Path]) -> String {
-    let lines: Vec<_> = ports.iter().flat_map(|port| [port.as_os_str().as_bytes(), b"\n"]).collect();
-    format!("dark-{:016x}", XxHash3_64::oneshot(&lines.concat()))
+fn line(port: &Path) -> Vec<u8> {
+    [port.as_os_str().as_bytes(), b"\n"].concat()
+}
+
+/// What the name of a note on the port of this name begins with.
+fn stem(port: &Path) -> String {
+    format!("dark-{:016x}", XxHash3_64::oneshot(&line(port)))
+}
+
+fn is_note(name: &str) -> bool {
+    name.strip_prefix("holod-").unwrap_or(name).starts_with("dark-")
 }
 
 fn is_named(name: &str, stem: &str) -> bool {
@@ -225,7 +258,7 @@ fn is_named(name: &str, stem: &str) -> bool {
 }
 
 /// Leaves notes of these contents in `folder`, where they are missing.
-fn leave_in(folder: &Path, contents: &BTreeMap<String, String>, name: impl Fn(&str) -> String) -> Result<(), String> {
+fn leave_in(folder: &Path, contents: &BTreeMap<String, Vec<u8>>, name: impl Fn(&str) -> String) -> Result<(), String> {
     for (stem, content) in contents {
         let path = folder.join(name(stem));
         // Only to look waits for no disk that stands still.
@@ -234,7 +267,7 @@ fn leave_in(folder: &Path, contents: &BTreeMap<String, String>, name: impl Fn(&s
         }
         match fs::File::create_new(&path) {
             // That it is there counts; what is in it is for people.
-            Ok(mut file) => drop(file.write_all(content.as_bytes())),
+            Ok(mut file) => drop(file.write_all(content)),
             Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
             Err(error) => return Err(format!("{}: {error}", path.display())),
         }
@@ -329,7 +362,7 @@ mod tests {
     fn a_note_of_an_older_holod_in_the_runtime_folder_is_seen() {
         let machine = Machine::new();
         let note = machine.on("/dev/lasers", false);
-        fs::write(machine.at("runtime").join(stem(&[Path::new("/dev/lasers")])), "").unwrap();
+        fs::write(machine.at("runtime").join(stem(Path::new("/dev/lasers"))), "").unwrap();
         assert!(is_there(&note) && note.take_away().is_none() && !is_there(&note));
     }
 
@@ -367,7 +400,7 @@ mod tests {
         assert!(stays.is_some_and(|stays| stays.starts_with(&folder)));
         fs::remove_file(&lock).unwrap();
         // As root may take any file away, and nobody a directory so.
-        let path = lock.join(format!("holod-{}-7", stem(&[Path::new("/dev/lasers")])));
+        let path = lock.join(format!("holod-{}-7", stem(Path::new("/dev/lasers"))));
         fs::create_dir_all(&path).unwrap();
         let stays = note.take_away();
         assert!(stays.is_some_and(|stays| stays.ends_with(&format!("`sudo rm {}`", path.display()))));
@@ -396,6 +429,35 @@ mod tests {
     }
 
     #[test]
+    fn lasers_that_come_back_elsewhere_or_are_away_keep_no_note_that_arming_does_not_find() {
+        let machine = Machine::new();
+        let port = |name: &str| machine.at("dev").join(name).display().to_string();
+        let plug = |number: usize| {
+            let node = port(&format!("ttyACM{number}"));
+            fs::write(&node, "").unwrap();
+            let _the_first_time = fs::remove_file(port("lasers"));
+            std::os::unix::fs::symlink(&node, port("lasers")).unwrap();
+        };
+        let [lasers, other] = ["lasers", "ttyACM2"].map(|name| machine.on(&port(name), true));
+        fs::write(port("ttyACM2"), "").unwrap();
+        for away in [false, true] {
+            other.leave();
+            for number in [0, 1] {
+                plug(number);
+                lasers.leave();
+                fs::remove_file(port(&format!("ttyACM{number}"))).unwrap();
+            }
+            if away {
+                fs::remove_file(port("lasers")).unwrap();
+            }
+            assert_eq!(names(&machine.at("state")).unwrap().len(), 4);
+            assert_eq!(lasers.take_away(), None);
+            assert_eq!(names(&machine.at("state")).unwrap().len(), 1, "that of the others; away: {away}");
+            assert!(is_there(&other));
+        }
+    }
+
+    #[test]
     fn some_of_several_ports_are_enough() {
         let machine = Machine::new();
         let on = |ports: &[&str]| {
@@ -410,8 +472,8 @@ mod tests {
         assert_eq!(green.take_away(), None);
         assert!(is_there(&all) && !is_there(&green));
         all.take_away();
-        let of_older_holod = stem(&[Path::new("/dev/red"), Path::new("/dev/green")]);
-        fs::write(machine.at("state").join(of_older_holod), "").unwrap();
+        // An older holod left one for all together.
+        fs::write(machine.at("state").join("dark-0123456789abcdef"), "/dev/red\n/dev/green\n").unwrap();
         assert!(is_there(&all));
     }
 

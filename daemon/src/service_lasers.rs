@@ -47,11 +47,12 @@ impl ServiceLasers {
         }
     }
 
-    /// The lasers are open, and will be driven.
+    /// The lasers are open, and will be driven. That they are to be put out is on the disk then.
     ///
     /// # Errors
     /// They would not be put out after this start.
     pub(crate) fn open(&self) -> Result<(), Failure> {
+        self.owe_darkness();
         match fs::remove_file(&self.not_opened) {
             Err(error) if error.kind() != ErrorKind::NotFound => Err(Failure::new(
                 Exit::Unavailable,
@@ -69,9 +70,16 @@ impl ServiceLasers {
         self.not_opened.try_exists().unwrap_or(false)
     }
 
-    /// They are told to go out.
+    /// They are to be told to go out.
     pub(crate) fn owe_darkness(&self) {
-        let _tried_once_only = File::create(&self.to_put_out);
+        let written = File::create(&self.to_put_out).and_then(|file| file.sync_all());
+        let folder = self.to_put_out.parent().map_or(Ok(()), |folder| File::open(folder)?.sync_all());
+        if let Err(error) = written.and(folder) {
+            tracing::warn!(
+                "{}: {error}: after a reset of the machine a start that fails early may leave the lasers as they are",
+                self.to_put_out.display()
+            );
+        }
     }
 
     /// They have acknowledged that they are dark.
@@ -101,6 +109,10 @@ mod tests {
         lasers.open().unwrap();
         assert!(!lasers.are_untouched());
         lasers.open().unwrap();
+        // The machine was reset, and nothing ran at the end of that start.
+        lasers.begin();
+        assert!(!lasers.are_untouched());
+        lasers.are_dark();
         lasers.begin();
         assert!(lasers.are_untouched());
     }

@@ -157,7 +157,8 @@ impl Logind {
         let released = || self.delays()[delays - 1].t_released;
         assert!(wait_until(PATIENCE, || released().is_some()), "{:?}", self.delays());
         let t_released = released().unwrap();
-        assert!(t_released - t_said < TimeNs(1_000_000_000), "{} s", (t_released - t_said).seconds());
+        // logind waits so long.
+        assert!(t_released - t_said < TimeNs(5_000_000_000), "{} s", (t_released - t_said).seconds());
         thread::sleep(Duration::from_millis(500));
         laser_box.assert_dark();
         let last = laser_box.edges().last().copied();

@@ -123,7 +123,10 @@ fn inputs(args: &RunArgs, rig: &Rig, tracker: &TrackerSpec) -> Vec<(&'static str
         WeightsChoice::File(path) => Some(("--weights", path.clone())),
         _ => None,
     };
-    let of_rig = files_of(rig).into_iter().map(|path| ("the rig", path));
+    let mut of_rig = rig.clone();
+    // What the run has in its place is among the tracker's files.
+    of_rig.tracker.spec = None;
+    let of_rig = files_of(&of_rig).into_iter().map(|path| ("the rig", path));
     let scene = args.scene.scene.iter().flat_map(|scene| scene.split(',')).map(|path| ("--scene", path.into()));
     let tracker = tracker.files().into_iter().map(|path| ("--tracker", path));
     config.chain(weights).chain(of_rig).chain(scene).chain(tracker).collect()

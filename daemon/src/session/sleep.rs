@@ -8,7 +8,7 @@ use std::convert::Infallible;
 use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use holod_calibration::rig::LaserDriver;
 use holod_slm_output::laser::DarkReason;
@@ -26,6 +26,8 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// How long a bus that is not there is left alone.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 const ANSWER_WITHIN: Duration = Duration::from_secs(5);
+/// A machine that is still awake so long after it was about to sleep will not.
+const SLEEPS_WITHIN: Duration = Duration::from_secs(60);
 /// logind's property.
 const PREPARING: &str = "PreparingForSleep";
 
@@ -49,22 +51,28 @@ enum News {
 }
 
 impl SleepWatch {
-    /// Begins to listen to logind, on a thread that ends soon after this is dropped. A run goes on without it.
+    /// Begins to listen to logind, on a thread that ends soon after this is dropped. A run goes on without it, and one
+    /// without lasers needs none.
     pub(crate) fn begin(driver: &LaserDriver) -> Self {
         let (sender, news) = mpsc::channel(1);
         let may_be_lit = Arc::new(AtomicBool::new(true));
-        let listener = Listener {
-            news: sender,
+        let this = Self {
+            news,
             may_be_lit: Arc::clone(&may_be_lit),
-            has_heartbeat: driver.has_heartbeat(),
             keeps_dark: false,
-            told: None,
+            may_sleep: None,
+            slept_before: Duration::ZERO,
         };
+        if matches!(driver, LaserDriver::Simulated) {
+            return this;
+        }
+        let listener =
+            Listener { news: sender, may_be_lit, has_heartbeat: driver.has_heartbeat(), dark_since: None, told: None };
         let thread = std::thread::Builder::new().name("holod-sleep".into()).spawn(move || listener.run());
         if let Err(error) = thread {
             tracing::warn!("lasers are not put out before the machine sleeps: cannot start a thread for that: {error}");
         }
-        Self { news, may_be_lit, keeps_dark: false, may_sleep: None, slept_before: Duration::ZERO }
+        this
     }
 
     /// Whether there is something that lasers are to be told: [`Self::keeps_dark`], and then [`Self::told`].
@@ -131,8 +139,9 @@ struct Listener {
     news: mpsc::Sender<News>,
     may_be_lit: Arc<AtomicBool>,
     has_heartbeat: bool,
-    /// The control thread was told that the machine sleeps, and not yet that it is awake.
-    keeps_dark: bool,
+    /// When the control thread was told that the machine sleeps, and what it had slept before; nothing once it was told
+    /// that it is awake. That time stands still while the machine sleeps.
+    dark_since: Option<(Instant, Duration)>,
     /// What people were told last: whether logind waits for the lasers.
     told: Option<bool>,
 }
@@ -169,12 +178,15 @@ impl Listener {
                 self.tell_fault(&error);
                 // Not longer than the run.
                 let _over = tokio::time::timeout(RETRY_AFTER, self.news.closed()).await;
+                if self.is_awake_again() && self.light().await.is_err() {
+                    return;
+                }
             }
         });
     }
 
     /// Listens until something ends that. Where the machine was about to sleep when the bus was lost, lasers stay dark
-    /// until it is known to be awake.
+    /// until it is known to be awake, or has not slept for a minute.
     async fn listen(&mut self) -> Result<Infallible, Ended> {
         if self.news.is_closed() {
             return Err(Ended::Run);
@@ -191,7 +203,7 @@ impl Listener {
         let mut signals = logind.receive_signal("PrepareForSleep").await?;
         let mut sleeps: bool = logind.get_property(PREPARING).await?;
         // In force until they are dropped.
-        let (mut delay, mut _idle) = (None, None);
+        let (mut delay, mut idle) = (None, None);
         let mut idle_wanted = false;
         loop {
             if sleeps {
@@ -203,15 +215,25 @@ impl Listener {
                 }
                 self.light().await?;
             }
+            let mut t_asked = Instant::now();
             sleeps = loop {
+                // What was refused may be granted later, as where polkit has only just been started.
+                let asks_again = t_asked.elapsed() >= RETRY_AFTER;
+                if asks_again {
+                    t_asked = Instant::now();
+                    if delay.is_none() && !sleeps {
+                        delay = self.delay(&logind).await;
+                    }
+                }
                 let may_be_lit = self.may_be_lit.load(Ordering::Relaxed);
-                if std::mem::replace(&mut idle_wanted, may_be_lit) != may_be_lit {
-                    _idle = if may_be_lit { keep_from_idle_sleep(&logind).await } else { None };
+                if std::mem::replace(&mut idle_wanted, may_be_lit) != may_be_lit || asks_again && idle.is_none() {
+                    idle = if may_be_lit { keep_from_idle_sleep(&logind).await } else { None };
                 }
                 match tokio::time::timeout(LOOK_EVERY, signals.next()).await {
                     Ok(Some(signal)) => break signal.body().deserialize()?,
                     Ok(None) => return Err(failure("the bus is gone").into()),
                     Err(_) if self.news.is_closed() => return Err(Ended::Run),
+                    Err(_) if sleeps && self.is_awake_again() => break false,
                     Err(_) if sleeps && !logind.get_property::<bool>(PREPARING).await? => break false,
                     Err(_) => {}
                 }
@@ -223,13 +245,20 @@ impl Listener {
     async fn make_dark(&mut self) -> Result<(), Ended> {
         let (may_sleep, dark) = oneshot::channel();
         self.news.send(News::Sleeps(may_sleep)).await?;
-        self.keeps_dark = true;
+        self.dark_since = Some((Instant::now(), slept()));
         let _over = dark.await;
         Ok(())
     }
 
+    /// Whether the machine has slept since the lasers were put out for that, or does not do so in a minute.
+    fn is_awake_again(&self) -> bool {
+        self.dark_since.is_some_and(|(t, slept_before)| {
+            slept().saturating_sub(slept_before) >= Duration::from_secs(1) || t.elapsed() >= SLEEPS_WITHIN
+        })
+    }
+
     async fn light(&mut self) -> Result<(), Ended> {
-        if std::mem::take(&mut self.keeps_dark) {
+        if self.dark_since.take().is_some() {
             self.news.send(News::Awake).await?;
         }
         Ok(())

@@ -202,7 +202,8 @@ pub(super) fn require_acceptance(lasers: &Lasers) -> Result<(), LaserError> {
 /// acknowledges that, whatever else it says.
 ///
 /// # Errors
-/// The last try's, after some seconds; [`LaserError::Line`], [`LaserError::Open`] and [`LaserError::NotAllowed`] at once.
+/// The last try's, after some seconds; [`LaserError::Line`] of a line that is not merely full, [`LaserError::Open`] and
+/// [`LaserError::NotAllowed`] at once.
 pub(super) fn put_out_beside<D>(
     clock: fn() -> TimeNs,
     open: impl Fn() -> Result<D, LaserError>,
@@ -225,10 +226,12 @@ pub(super) fn put_out_beside<D>(
     loop {
         match attempt() {
             Ok(()) => return Ok(()),
+            Err(last) if clock() >= t_end => return Err(last),
+            // There was no room on the line for the word, since the other host talks much.
+            Err(LaserError::Line(full)) if full.kind() == ErrorKind::WouldBlock => std::thread::sleep(BESIDE_REST),
             Err(final_one @ (LaserError::Line(_) | LaserError::Open { .. } | LaserError::NotAllowed { .. })) => {
                 return Err(final_one);
             }
-            Err(last) if clock() >= t_end => return Err(last),
             Err(_) => std::thread::sleep(BESIDE_REST),
         }
     }

@@ -49,8 +49,12 @@ pub(super) struct RefreshJudge {
     needed: u32,
     strays: u32,
     t_before: Option<TimeNs>,
+    /// The controller's count of the newest report.
+    count_before: Option<u64>,
     shown_period_ns: Option<f64>,
     alike: Alike,
+    /// The panel was found to run at a part of its rate.
+    runs_slower: bool,
 }
 
 /// The last intervals between reports that had as many periods of the rate that is shown as each other.
@@ -96,8 +100,10 @@ impl RefreshJudge {
             needed: agreeing_at_first(clock),
             strays: 0,
             t_before: None,
+            count_before: None,
             shown_period_ns: None,
             alike: Alike::default(),
+            runs_slower: false,
         }
     }
 
@@ -118,7 +124,7 @@ impl RefreshJudge {
     /// [`DarkReason::Untrusted`] where it is not believed.
     pub(super) fn judge(&mut self, refresh: &PresentedRefresh) -> Result<(), DarkReason> {
         let t_before = self.t_before.unwrap_or(TimeNs(0));
-        self.note_rate(refresh.t_present);
+        self.note_rate(refresh);
         if refresh.t_present <= TimeNs(0) {
             self.agreeing = 0;
             return Err(DarkReason::Untrusted);
@@ -198,22 +204,35 @@ impl RefreshJudge {
         steps >= 1 && steps as f64 <= periods
     }
 
-    fn note_rate(&mut self, t: TimeNs) {
-        if let Some(t_before) = self.t_before.replace(t) {
-            let interval_ns = (t.0 - t_before.0) as f64;
-            let periods = (interval_ns / self.shown_period_ns.unwrap_or(self.nominal_ns)).round().max(1.0);
-            let in_a_row = if periods == self.alike.periods { self.alike.in_a_row + 1 } else { 1 };
-            self.alike = Alike { periods, in_a_row };
-            let runs_slower = periods > 1.0 && in_a_row >= SLOWER_IN_A_ROW;
-            if runs_slower {
-                self.shown_period_ns = None;
-            }
-            let period_ns = if runs_slower { interval_ns } else { interval_ns / periods };
-            if period_ns > 0.1 * self.nominal_ns && period_ns < 10.0 * self.nominal_ns {
-                let shown_ns = self.shown_period_ns.get_or_insert(period_ns);
-                *shown_ns += RATE_GAIN * (period_ns - *shown_ns);
-            }
+    fn note_rate(&mut self, refresh: &PresentedRefresh) {
+        let t = refresh.t_present;
+        let count_before = std::mem::replace(&mut self.count_before, refresh.refresh_count);
+        let Some(t_before) = self.t_before.replace(t) else { return };
+        let interval_ns = (t.0 - t_before.0) as f64;
+        let counted = count_before.zip(refresh.refresh_count).and_then(|(before, now)| now.checked_sub(before));
+        let period_ns = match counted.filter(|&refreshes| refreshes > 0) {
+            Some(refreshes) => interval_ns / refreshes as f64,
+            None => self.uncounted_period_ns(interval_ns),
+        };
+        if period_ns > 0.1 * self.nominal_ns && period_ns < 10.0 * self.nominal_ns {
+            let shown_ns = self.shown_period_ns.get_or_insert(period_ns);
+            *shown_ns += RATE_GAIN * (period_ns - *shown_ns);
         }
+    }
+
+    /// The period of a panel that nobody counts the refreshes of, from an interval in which reports may be missing.
+    fn uncounted_period_ns(&mut self, interval_ns: f64) -> f64 {
+        if self.runs_slower && interval_ns < 1.5 * self.nominal_ns {
+            (self.runs_slower, self.shown_period_ns) = (false, None);
+        }
+        let periods = (interval_ns / self.shown_period_ns.unwrap_or(self.nominal_ns)).round().max(1.0);
+        let in_a_row = if periods == self.alike.periods { self.alike.in_a_row + 1 } else { 1 };
+        self.alike = Alike { periods, in_a_row };
+        if periods > 1.0 && in_a_row >= SLOWER_IN_A_ROW {
+            (self.runs_slower, self.shown_period_ns) = (true, None);
+            return interval_ns;
+        }
+        interval_ns / periods
     }
 }
 
@@ -398,18 +417,22 @@ mod tests {
 
     #[test]
     fn a_panel_at_a_part_of_its_rate_is_told_from_one_whose_reports_are_missed() {
-        let refresh_hz = |every: &dyn Fn(i64) -> bool| {
+        let told_hz = |every: &dyn Fn(i64) -> bool, counted: bool| {
             let mut judge = judge();
             for count in (1..400).filter(|&count| every(count)) {
-                let _believed = judge.judge(&report(count * PERIOD, None));
+                let _believed = judge.judge(&report(count * PERIOD, counted.then_some(count as u64)));
             }
             judge.refresh_hz()
         };
+        let refresh_hz = |every: &dyn Fn(i64) -> bool| told_hz(every, false);
         assert!((refresh_hz(&|count| count % 2 == 0) - 30.0).abs() < 1e-3);
         assert!((refresh_hz(&|count| count % 3 == 0) - 20.0).abs() < 1e-3);
         // Of each nine in a row three are missed, so that whole runs of intervals have two periods.
         assert!((refresh_hz(&|count| ![1, 3, 5].contains(&(count % 9))) - 60.0).abs() < 1e-3);
-        // At its own rate again.
+        // At its own rate again, also where reports are missed then.
         assert!(refresh_hz(&|count| count > 100 || count % 2 == 0) > 59.9);
+        assert!(refresh_hz(&|count| (count > 100 && count % 3 > 0) || count % 2 == 0) > 59.9);
+        // Where they are counted it is known how many were missed.
+        assert!((told_hz(&|count| count % 2 == 0, true) - 60.0).abs() < 1e-3);
     }
 }
