@@ -132,6 +132,10 @@ impl DarkNote {
         let ports: Vec<_> = self.ports.iter().map(|port| line(&whole(port))).collect();
         // One that lists a port as the rig names it is on that port, too, whatever links led there when it was left.
         let lists_a_port = |note: &Path| {
+            // Anybody may put a pipe into a shared folder, whose reader waits for a writer.
+            if !note.symlink_metadata().is_ok_and(|metadata| metadata.is_file()) {
+                return false;
+            }
             let read = fs::File::open(note).and_then(|file| {
                 let mut content = Vec::new();
                 file.take(CONTENT_BYTES_MAX).read_to_end(&mut content).map(|_| content)
@@ -455,6 +459,14 @@ mod tests {
             assert_eq!(names(&machine.at("state")).unwrap().len(), 1, "that of the others; away: {away}");
             assert!(is_there(&other));
         }
+    }
+
+    #[test]
+    fn a_pipe_among_notes_keeps_nobody_waiting() {
+        let machine = Machine::new();
+        let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;
+        rustix::fs::mkfifoat(rustix::fs::CWD, machine.at("lock").join("dark-0123456789abcdef"), mode).unwrap();
+        assert!(!is_there(&machine.on("/dev/lasers", true)));
     }
 
     #[test]
