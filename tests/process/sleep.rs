@@ -259,10 +259,12 @@ fn lasers_are_put_out_also_where_logind_does_not_wait_for_them() {
     logind.known.refuses.store(true, Ordering::Release);
     let daemon = laser_box.lit_daemon_with(&[("DBUS_SYSTEM_BUS_ADDRESS", &bus.address)]);
     logind.prepare(true);
-    thread::sleep(Duration::from_secs(1));
-    let lit_before = laser_box.edges().len();
-    thread::sleep(Duration::from_millis(500));
-    assert_eq!(laser_box.edges().len(), lit_before);
+    let is_dark = || {
+        let lit_before = laser_box.edges().len();
+        thread::sleep(Duration::from_millis(500));
+        laser_box.edges().len() == lit_before
+    };
+    assert!(wait_until(PATIENCE, is_dark));
     logind.prepare(false);
     assert!(are_lit_again(&laser_box));
     daemon.signal(Signal::TERM);
