@@ -9,6 +9,8 @@ use holod_model::Weights;
 use holod_model::conditions::BenchFit;
 use holod_model::weights::WeightsError;
 use holod_pupil_input::{ReplayError, SourceError, TrackerError, TrackerSpec};
+use holod_slm_output::present::Presenter;
+use holod_slm_output::present::drm::Verdict;
 
 use crate::cli::{NetworkArgs, RigArgs};
 use crate::failure::{Exit, Failure};
@@ -55,6 +57,13 @@ pub fn rig_to_show(args: &RigArgs, network: &NetworkArgs) -> Result<Rig, Failure
 pub fn warn_of_panel(rig: &Rig) {
     for warning in rig.panel.warnings() {
         tracing::warn!("{warning}");
+    }
+}
+
+/// Warns of what most likely changes levels on their way to the opened panel.
+pub fn warn_of_link(panel: &dyn Presenter) {
+    for check in panel.checks().iter().filter(|check| check.verdict == Verdict::Doubtful) {
+        tracing::warn!("{check}");
     }
 }
 

@@ -26,10 +26,10 @@ pub(super) const USUAL_RIG: &str = "/etc/holod/rig.toml";
 pub(super) const STATE_FOLDER: &str = "/var/lib/holod";
 /// Networks that no address of the wider Internet is in.
 const PRIVATE_NETWORKS: &str = "link-local 192.168.0.0/16 10.0.0.0/8 172.16.0.0/12 fc00::/7";
-/// For a start that fails where the network is not up: it waits for that,
-const ONLINE_UNIT: &str = "[Unit]\nWants=network-online.target\nAfter=network-online.target\n";
-/// and since the target may be reached earlier than an address or a route is there, the starts that the unit grants are
-/// spread over more than half a minute. Lasers are dark between them.
+/// What a start waits for that fails where the network is not up.
+const ONLINE_UNIT: &str = "network-online.target";
+/// That target may be reached before an address or a route is there, so the starts that the unit grants are spread over
+/// more than half a minute. Lasers are dark between them.
 const ONLINE_SERVICE: &str = "RestartSec=10\n";
 
 pub(super) fn unit(args: &UnitArgs) -> Result<(), Failure> {
@@ -68,8 +68,11 @@ pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -
     let mut text =
         "# Written by `holod unit`: what this bench needs of the unit. Write it anew when rig or devices change.\n"
             .to_owned();
-    if needs.online {
-        text.push_str(ONLINE_UNIT);
+    let awaited: Vec<&str> =
+        needs.online.then_some(ONLINE_UNIT).into_iter().chain(needs.modules.iter().map(String::as_str)).collect();
+    if !awaited.is_empty() {
+        let units = awaited.join(" ");
+        text.push_str(&format!("[Unit]\nWants={units}\nAfter={units}\n"));
     }
     text.push_str(&format!("[Service]\nExecStart=\nExecStart={BINARY} run {}\n", command.join(" ")));
     if config != Path::new(USUAL_RIG) {
@@ -93,6 +96,8 @@ pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -
 #[derive(Debug, Default)]
 struct Needs {
     devices: BTreeSet<String>,
+    /// The units that load drivers of its panel and GPU, without which it would find neither.
+    modules: BTreeSet<String>,
     /// Whether it listens or connects on a network, if only this machine's own.
     network: bool,
     /// Other machines' addresses, as systemd writes them.
@@ -155,6 +160,7 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
         OutputSpec::Headless(_) => {}
         OutputSpec::Drm(target) => {
             needs.devices.insert(card(&target, root));
+            needs.modules.extend(drivers("card", root));
         }
         OutputSpec::Window(_) => {
             let says = "--output window: the service has no desktop; give the panel a connector with --output drm:";
@@ -163,6 +169,7 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
     }
     if run.backend.takes_a_gpu() {
         needs.devices.extend(gpus(root));
+        needs.modules.extend(drivers("renderD", root));
     }
     Ok(needs)
 }
@@ -256,6 +263,15 @@ fn gpus(root: &Path) -> Vec<String> {
     let names = characters.filter_map(|line| line.split_whitespace().nth(1));
     devices.extend(names.filter(|name| name.starts_with("nvidia")).map(|name| format!("char-{name}")));
     devices
+}
+
+/// The units that load the drivers of these cards or render nodes, as far as the drivers are modules.
+fn drivers(nodes: &str, root: &Path) -> Vec<String> {
+    let class = root.join("sys/class/drm");
+    let module = |node: &String| fs::read_link(class.join(node).join("device/driver/module")).ok();
+    let modules = names(&class, nodes).iter().filter_map(module).collect::<BTreeSet<_>>();
+    let names = modules.iter().filter_map(|module| module.file_name()?.to_str());
+    names.map(|name| format!("modprobe@{name}.service")).collect()
 }
 
 /// A card or render node by the place where it sits, since numbers change.
@@ -435,6 +451,7 @@ mod tests {
         let card = "/dev/dri/by-path/pci-0000:01:00.0-card";
         let all = [card, "/dev/dri/renderD128", "char-nvidia", "char-ttyACM", "char-ttyUSB"];
         assert_eq!(allowed(&text), all, "{text}");
+        assert!(!text.contains("[Unit]"), "drivers that are no modules: {text}");
         assert!(
             text.contains("ExecStart=\nExecStart=/usr/bin/holod run --config /etc/holod/rig.toml --output drm:DP-2\n")
         );
@@ -448,6 +465,30 @@ mod tests {
         // A monitor's name may be at any card.
         let named = drop_in_of(&[&RIG[..], &["--output", "drm:PLUTO-2.1"]].concat(), &rig(), root.path()).unwrap();
         assert!(allowed(&named).contains(&"char-drm"), "{named}");
+    }
+
+    #[test]
+    fn drivers_of_panel_and_gpu_are_waited_for() {
+        let root = machine();
+        for (node, driver) in
+            [("card0", "ast"), ("card1", "amdgpu"), ("renderD128", "amdgpu"), ("renderD129", "nvidia")]
+        {
+            let folder = root.path().join("sys/class/drm").join(node).join("device/driver");
+            fs::create_dir_all(&folder).unwrap();
+            symlink(format!("../../../../module/{driver}"), folder.join("module")).unwrap();
+        }
+        let waits = |words: &[&str]| {
+            let text = drop_in_of(&[&RIG[..], words].concat(), &rig(), root.path()).unwrap();
+            let of = |key: &str| text.lines().find_map(|line| line.strip_prefix(key).map(str::to_owned));
+            assert_eq!(of("Wants="), of("After="), "{text}");
+            of("After=")
+        };
+        let [amdgpu, ast, nvidia] = ["amdgpu", "ast", "nvidia"].map(|module| format!("modprobe@{module}.service"));
+        assert_eq!(waits(&[]), Some(format!("{amdgpu} {nvidia}")));
+        assert_eq!(waits(&["--backend", "cpu"]), None);
+        assert_eq!(waits(&["--backend", "cpu", "--output", "drm:DP-2"]), Some(format!("{amdgpu} {ast}")));
+        let all = ["--tracker", "core:192.0.2.7", "--output", "drm:DP-2"];
+        assert_eq!(waits(&all), Some(format!("network-online.target {amdgpu} {ast} {nvidia}")));
     }
 
     #[test]

@@ -311,6 +311,7 @@ fn open_output(plan: &SessionPlan, encoder: &PanelEncoder, options: OutputOption
     let unavailable = Failure::because::<OutputError>(Exit::Unavailable);
     let panel = open_panel(&plan.output, &PanelSetup::new(&rig.panel, encoder), host_now());
     let panel = panel.map_err(|error| unavailable(error.into()))?;
+    setup::warn_of_link(&*panel);
     #[cfg(feature = "fault-injection")]
     let panel = Box::new(crate::fault::FaultyPanel(panel));
     let laser = open_laser(&rig.lasers, host_now).map_err(|error| unavailable(error.into()))?;

@@ -79,7 +79,7 @@ fn can_do(rig: &Rig, found: Option<&BoxReport>) -> Result<(), LaserError> {
 fn passes(rig: &Rig, found: Verdict) -> bool {
     match found {
         Verdict::Right | Verdict::Unverified => true,
-        Verdict::Wrong => false,
+        Verdict::Wrong | Verdict::Doubtful => false,
         Verdict::Dark => times_itself(rig) || matches!(rig.lasers.driver, LaserDriver::Simulated),
     }
 }
@@ -187,6 +187,7 @@ mod tests {
             (rig.lasers.driver, rig.panel.mode) = (driver, mode);
             assert_eq!(passes(&rig, Verdict::Dark), fits, "{:?}", rig.lasers.driver);
             assert!(passes(&rig, Verdict::Right) && passes(&rig, Verdict::Unverified) && !passes(&rig, Verdict::Wrong));
+            assert!(!passes(&rig, Verdict::Doubtful));
         }
     }
 }

@@ -14,6 +14,7 @@ use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, Pa
 use crate::cli::PatternTarget;
 use crate::failure::{Exit, Failure};
 use crate::session::{LaserBoxWatch, NO_ACKNOWLEDGEMENT, PANEL_HANGS, Signals, SleepWatch, not_dark};
+use crate::setup;
 
 /// Time that a frame may take before it has been measured.
 const FIRST_COPY: TimeNs = TimeNs(5_000_000);
@@ -138,6 +139,7 @@ pub(super) fn show(
 
 fn open(spec: &OutputSpec, rig: &Rig, encoder: &PanelEncoder) -> Result<Output, OutputError> {
     let panel = open_panel(spec, &PanelSetup::new(&rig.panel, encoder), host_now())?;
+    setup::warn_of_link(&*panel);
     let laser = open_laser(&rig.lasers, host_now)?;
     let options = OutputOptions::default();
     let stall_timeout = rig.lasers.stall_timeout.unwrap_or(options.stall_timeout);

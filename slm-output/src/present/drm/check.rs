@@ -2,6 +2,9 @@
 
 use std::fmt;
 
+/// What carries the levels to the panel; other models than RGB have fewer of them.
+pub(crate) const COLOUR_MODEL: &str = "colour model of the link";
+
 /// One thing that was looked at on the way to the panel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DisplayCheck {
@@ -24,6 +27,8 @@ pub enum Verdict {
     Wrong,
     /// The driver does not tell.
     Unverified,
+    /// The driver does not tell, but is known to do otherwise.
+    Doubtful,
     /// Lasers stay dark by it, but those of a box that times itself by the panel's sync output.
     Dark,
 }
@@ -34,6 +39,7 @@ impl fmt::Display for DisplayCheck {
             Verdict::Right => "right",
             Verdict::Wrong => "WRONG",
             Verdict::Unverified => "not verified",
+            Verdict::Doubtful => "most likely WRONG",
             Verdict::Dark => "lasers stay dark but those of a box with a sync wire in channel-packed mode",
         };
         write!(f, "{}: {}, wanted {} ({verdict})", self.name, self.found, self.wanted)
@@ -50,11 +56,15 @@ impl DisplayCheck {
 
     /// A check that could not be made.
     pub(crate) fn unverified(name: &str, found: &str, wanted: impl ToString) -> Self {
-        Self {
-            name: name.to_owned(),
-            found: found.to_owned(),
-            wanted: wanted.to_string(),
-            verdict: Verdict::Unverified,
-        }
+        let (name, found, wanted) = (name.to_owned(), found.to_owned(), wanted.to_string());
+        Self { name, found, wanted, verdict: Verdict::Unverified }
+    }
+
+    /// What is to be said of a connector that [sends it](super::SeenConnector::sends_ycbcr_444).
+    pub(crate) fn ycbcr_444() -> Self {
+        let found = "YCbCr 4:4:4, which amdgpu sends to HDMI monitors that offer it, as this one does: about 220 of 256 \
+                     levels are left; use DisplayPort, or take the offer from the EDID (slm-output/doc/drm.md, \
+                     \"YCbCr\")";
+        Self { verdict: Verdict::Doubtful, ..Self::unverified(COLOUR_MODEL, found, "RGB") }
     }
 }

@@ -1,4 +1,4 @@
-//! The few things that are read from a monitor's EDID: who it is and how large it is.
+//! The few things that are read from a monitor's EDID: who it is, how large it is, and which colour models it takes.
 
 use holod_calibration::Resolution;
 
@@ -8,7 +8,7 @@ const HEADER: [u8; 8] = [0, 255, 255, 255, 255, 255, 255, 0];
 const DESCRIPTORS: std::ops::Range<usize> = 54..126;
 const DESCRIPTOR_BYTES: usize = 18;
 
-/// A monitor's identity, from the base block of its EDID (VESA E-EDID 1.4).
+/// What a monitor says of itself, from the base block of its EDID (VESA E-EDID 1.4) and its CTA-861 extensions.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Edid {
     /// The maker's three letters.
@@ -23,13 +23,17 @@ pub struct Edid {
     pub serial: Option<String>,
     /// Pixels of the first detailed timing, which is the panel's own where a panel has pixels.
     pub native: Option<Resolution>,
+    /// Whether the monitor takes YCbCr 4:4:4, too, which some drivers send then in place of RGB.
+    pub takes_ycbcr_444: bool,
 }
 
 impl Edid {
-    /// Reads the base block; `None` where it is none or its check sum is wrong.
+    /// Reads the base block and the extensions behind it that are whole; `None` where the former is none or its check
+    /// sum is wrong.
     pub fn parse(bytes: &[u8]) -> Option<Self> {
-        let block = bytes.get(..BLOCK_BYTES)?;
-        if block[..8] != HEADER || block.iter().fold(0u8, |sum, &byte| sum.wrapping_add(byte)) != 0 {
+        let mut blocks = bytes.chunks_exact(BLOCK_BYTES);
+        let block = blocks.next()?;
+        if block[..8] != HEADER || !sums_to_zero(block) {
             return None;
         }
         let maker = u16::from_be_bytes([block[8], block[9]]);
@@ -53,6 +57,7 @@ impl Edid {
             name: text(0xfc),
             serial: text(0xff),
             native,
+            takes_ycbcr_444: base_takes_ycbcr_444(block) || blocks.any(extension_takes_ycbcr_444),
         })
     }
 
@@ -65,6 +70,22 @@ impl Edid {
             || serial.as_deref().is_some_and(same)
             || (self.serial_number != 0 && same(&self.serial_number.to_string()))
     }
+}
+
+fn sums_to_zero(block: &[u8]) -> bool {
+    block.iter().fold(0u8, |sum, &byte| sum.wrapping_add(byte)) == 0
+}
+
+/// Bit 3 of the features, of which a digital input's are colour models since revision 4 (VESA E-EDID 1.4, 3.6.4).
+fn base_takes_ycbcr_444(block: &[u8]) -> bool {
+    let (revision, is_digital, features) = (block[19], block[20] & 0x80 != 0, block[24]);
+    revision >= 4 && is_digital && features & 0x08 != 0
+}
+
+/// Bit 5 of byte 3, since version 2 of the extension (CTA-861-H, 7.5).
+fn extension_takes_ycbcr_444(block: &[u8]) -> bool {
+    const CTA_861: u8 = 2;
+    sums_to_zero(block) && block[0] == CTA_861 && block[1] >= 2 && block[3] & 0x20 != 0
 }
 
 impl std::fmt::Display for Edid {
@@ -104,9 +125,22 @@ pub(crate) mod tests {
             bytes.resize(13, b' ');
             block[place + 5..place + 18].copy_from_slice(&bytes);
         }
+        sealed(block)
+    }
+
+    /// A block with its check sum set right.
+    fn sealed(mut block: Vec<u8>) -> Vec<u8> {
+        block[127] = 0;
         let sum = block.iter().fold(0u8, |sum, &byte| sum.wrapping_add(byte));
         block[127] = sum.wrapping_neg();
         block
+    }
+
+    /// A base block like [`block`]'s, followed by a CTA-861 extension with these features.
+    pub(crate) fn block_with_extension(resolution: Resolution, features: u8) -> Vec<u8> {
+        let mut extension = vec![0; BLOCK_BYTES];
+        extension[..4].copy_from_slice(&[2, 3, 4, features]);
+        [block(resolution, "HOLOEYE", "1", 0), sealed(extension)].concat()
     }
 
     const FULL_HD: Resolution = Resolution { width: 1920, height: 1080 };
@@ -121,6 +155,7 @@ pub(crate) mod tests {
             name: Some("PLUTO-2.1".into()),
             serial: Some("6001-0815".into()),
             native: Some(FULL_HD),
+            takes_ycbcr_444: false,
         };
         assert_eq!(edid, expected);
         assert_eq!(edid.to_string(), r#""PLUTO-2.1" serial "6001-0815""#);
@@ -150,5 +185,29 @@ pub(crate) mod tests {
         assert_eq!((&edid.name, &edid.serial), (&None, &None));
         assert_eq!(edid.to_string(), "HLD 0102");
         assert!(!edid.is("") && !edid.is("0"));
+    }
+
+    #[test]
+    fn colour_models_are_read_from_both_places() {
+        let takes = |bytes: &[u8]| Edid::parse(bytes).unwrap().takes_ycbcr_444;
+        assert!(takes(&block_with_extension(FULL_HD, 0x20)));
+        assert!(takes(&block_with_extension(FULL_HD, 0xf0)));
+        for none in [0x00, 0x10, 0xc0] {
+            assert!(!takes(&block_with_extension(FULL_HD, none)), "features {none:#x}");
+        }
+        let mut torn = block_with_extension(FULL_HD, 0x20);
+        torn[BLOCK_BYTES + 50] ^= 1;
+        assert!(!takes(&torn));
+        assert!(!takes(&block_with_extension(FULL_HD, 0x20)[..255]));
+
+        let base = |revision: u8, input: u8, features: u8| {
+            let mut block = block(FULL_HD, "A", "B", 1);
+            (block[18], block[19], block[20], block[24]) = (1, revision, input, features);
+            takes(&sealed(block))
+        };
+        assert!(base(4, 0xa5, 0x08));
+        assert!(!base(3, 0xa5, 0x08), "revision 3 means a kind of display by it");
+        assert!(!base(4, 0x25, 0x08), "an analogue input, too");
+        assert!(!base(4, 0xa5, 0x10));
     }
 }

@@ -14,12 +14,23 @@ pub(crate) const SYS_CLASS_DRM: &str = "/sys/class/drm";
 pub struct SeenConnector {
     /// The card's device node, for example `/dev/dri/card0`.
     pub card: PathBuf,
+    /// The card's driver, for example `amdgpu`, where the kernel says.
+    pub driver: Option<String>,
     /// The connector's name, for example `DP-1`.
     pub name: String,
     /// Whether a monitor is at it; `None` where the driver cannot tell.
     pub connected: Option<bool>,
     /// Who the monitor is, where it says so.
     pub edid: Option<Edid>,
+}
+
+impl SeenConnector {
+    /// Whether the monitor gets YCbCr 4:4:4 in place of RGB: amdgpu, which has no property for it, sends it to each HDMI
+    /// monitor that takes it.
+    pub(crate) fn sends_ycbcr_444(&self) -> bool {
+        let takes_it = self.edid.as_ref().is_some_and(|edid| edid.takes_ycbcr_444);
+        self.driver.as_deref() == Some("amdgpu") && self.name.starts_with("HDMI-") && takes_it
+    }
 }
 
 /// All connectors, for messages.
@@ -71,8 +82,10 @@ pub(crate) fn seen_connectors(class: &Path) -> ConnectorList {
 
 fn read_connector(folder: &Path, card: &str, connector: &str) -> SeenConnector {
     let status = fs::read_to_string(folder.join("status")).unwrap_or_default();
+    let driver = fs::read_link(folder.with_file_name(card).join("device/driver")).ok();
     SeenConnector {
         card: Path::new("/dev/dri").join(card),
+        driver: driver.and_then(|driver| Some(driver.file_name()?.to_str()?.to_owned())),
         name: connector.to_owned(),
         connected: match status.trim() {
             "connected" => Some(true),
@@ -104,7 +117,9 @@ pub(crate) fn choose(all: ConnectorList, asked: &str, card: Option<&Path>) -> Re
 
 #[cfg(test)]
 mod tests {
-    use super::super::edid::tests::block;
+    use std::os::unix::fs::symlink;
+
+    use super::super::edid::tests::{block, block_with_extension};
     use super::*;
     use holod_calibration::Resolution;
 
@@ -170,5 +185,25 @@ mod tests {
         assert_eq!(count(choose(all.clone(), "DP-1", None)), (2, 2));
         assert_eq!(count(choose(all, "PLUTO", None)), (2, 2));
         assert_eq!(count(choose(seen_connectors(Path::new("/nowhere")), "DP-1", None)), (9, 0));
+    }
+
+    #[test]
+    fn only_amdgpu_is_known_to_send_ycbcr_to_an_hdmi_monitor_that_takes_it() {
+        const YCBCR_444: u8 = 0x20;
+        let class = machine();
+        let size = Resolution { width: 1920, height: 1080 };
+        for (card, driver) in [("card0", "i915"), ("card1", "amdgpu")] {
+            fs::create_dir(class.path().join(card).join("device")).unwrap();
+            symlink(format!("../../../bus/pci/drivers/{driver}"), class.path().join(card).join("device/driver"))
+                .unwrap();
+        }
+        for name in ["card0-HDMI-A-1", "card1-DP-1", "card1-HDMI-A-1"] {
+            put(class.path(), name, "connected", &block_with_extension(size, YCBCR_444));
+        }
+        put(class.path(), "card1-HDMI-A-2", "connected", &block_with_extension(size, 0));
+        let all = seen_connectors(class.path());
+        let sending: Vec<_> = all.0.iter().filter(|seen| seen.sends_ycbcr_444()).map(|seen| &seen.name).collect();
+        assert_eq!(sending, ["HDMI-A-1"]);
+        assert_eq!(all.0.iter().find(|seen| seen.name == "DP-1").unwrap().driver.as_deref(), Some("i915"));
     }
 }

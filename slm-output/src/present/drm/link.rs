@@ -381,7 +381,7 @@ impl Ready {
         let shown = words(rectangle(0, ["CRTC_X", "CRTC_Y", "CRTC_W", "CRTC_H"]));
         checks.push(DisplayCheck::equal("pixels taken from the buffer", source, &whole));
         checks.push(DisplayCheck::equal("pixels shown", shown, &whole));
-        checks.extend(settings::read_back(&properties, wanted.channel_bits));
+        checks.extend(settings::read_back(&properties, wanted.channel_bits, seen));
         let covers =
             |plane: &plane::Handle| card.get_plane(*plane).is_ok_and(|info| info.crtc() == Some(self.pipe.crtc));
         let covering = self.pipe.other_planes.iter().filter(|plane| covers(plane)).count();

@@ -32,6 +32,8 @@ pub use check::{DisplayCheck, Verdict};
 pub use edid::Edid;
 pub use error::DrmError;
 pub use find::{ConnectorList, SeenConnector};
+#[cfg(feature = "window")]
+pub(crate) use find::{SYS_CLASS_DRM, seen_connectors};
 pub use margin::CommitMargin;
 pub use timing::{FlipClock, FlipFaults, FlipStamp, Refresh};
 

@@ -6,7 +6,8 @@ use drm::control::property::{self, ValueType};
 use drm::control::{AtomicCommitFlags, Device as _, RawResourceHandle};
 
 use super::card::{Card, Pipe};
-use super::check::DisplayCheck;
+use super::check::{COLOUR_MODEL, DisplayCheck};
+use super::find::SeenConnector;
 use super::properties::{PipeProperties, Properties};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,6 +45,9 @@ const fn setting(name: &'static str, on: On, property: &'static str, want: Want,
 /// and of the drivers i915, xe, amdgpu, radeon, nouveau, nvidia-drm and vc4.
 const SETTINGS: &[Setting] = &[
     setting("range of RGB", On::Connector, "Broadcast RGB", Want::Named("Full"), true),
+    setting(COLOUR_MODEL, On::Connector, "color format", Want::Named("RGB"), false),
+    setting(COLOUR_MODEL, On::Connector, "Output format", Want::Named("RGB"), false),
+    setting(COLOUR_MODEL, On::Connector, "preferred color format", Want::Named("RGB"), false),
     setting("bits of a channel on the link", On::Connector, "max bpc", Want::ChannelBits, true),
     setting("gamma table", On::Crtc, "GAMMA_LUT", Want::NoBlob, true),
     setting("degamma table", On::Crtc, "DEGAMMA_LUT", Want::NoBlob, false),
@@ -214,8 +218,8 @@ pub(crate) fn restore(card: &Card, changes: &[Change]) {
     }
 }
 
-/// What the properties are now, beside what they must be.
-pub(crate) fn read_back(properties: &PipeProperties, channel_bits: u8) -> Vec<DisplayCheck> {
+/// What the properties of the `seen` connector are now, beside what they must be.
+pub(crate) fn read_back(properties: &PipeProperties, channel_bits: u8, seen: &SeenConnector) -> Vec<DisplayCheck> {
     let check = |setting: &Setting| {
         let must = wanted_words(setting.want, channel_bits);
         let name = format!("{} ({})", setting.name, setting.property);
@@ -236,6 +240,9 @@ pub(crate) fn read_back(properties: &PipeProperties, channel_bits: u8) -> Vec<Di
     let mut checks: Vec<_> = SETTINGS.iter().filter_map(check).collect();
     if !checks.iter().any(|check| check.name.starts_with("dithering")) {
         checks.push(DisplayCheck::unverified("dithering", "the driver does not say", "off"));
+    }
+    if !checks.iter().any(|check| check.name.starts_with(COLOUR_MODEL)) {
+        checks.extend(seen.sends_ycbcr_444().then(DisplayCheck::ycbcr_444));
     }
     checks
 }

@@ -36,7 +36,7 @@ use self::timeline::{Lead, Outcome, Presented, Timeline};
 use self::watch::Watched;
 use crate::fields::{FIELDS, FrameTag, LevelsFrame};
 use crate::packing::{PIXEL_BYTES, PixelFormat, write_frame};
-use crate::present::drm::{DisplayCheck, Verdict};
+use crate::present::drm::{DisplayCheck, SYS_CLASS_DRM, Verdict, seen_connectors};
 use crate::present::{
     FrameSource, PanelFault, PanelSetup, PanelTiming, PresentedRefresh, Presenter, TimestampSource, WindowSpec,
 };
@@ -590,6 +590,8 @@ fn checks(monitor: &Monitor, panel: &PanelMonitor, last: Option<watch::Completio
         let verdict = if native == panel.resolution { Verdict::Right } else { Verdict::Unverified };
         checks.push(check("the monitor's own size by its EDID", size(native), size(panel.resolution), verdict));
     }
+    let there = seen_connectors(Path::new(SYS_CLASS_DRM));
+    checks.extend(monitor.gets_ycbcr_444(&there).then(DisplayCheck::ycbcr_444));
     let unseen = "the display server is not asked; set them in the graphics driver's settings, or use drm:CONNECTOR";
     checks.push(DisplayCheck::unverified("full range, no underscan, no dithering", unseen, "all three"));
     checks

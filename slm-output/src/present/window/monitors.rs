@@ -6,7 +6,7 @@ use std::fmt;
 use holod_calibration::Resolution;
 use holod_calibration::rig::Panel;
 
-use crate::present::drm::Edid;
+use crate::present::drm::{ConnectorList, Edid};
 use crate::present::{AlterationKind, PanelFault, WindowSpec};
 
 /// How far a mode's refresh rate may be from the rig's, as a share of it: 59.94 and 59.95 Hz are "60 Hz" to those who
@@ -82,6 +82,12 @@ impl Monitor {
     fn has_mode_of(&self, panel: &PanelMonitor) -> bool {
         let rate_fits = |hz: f64| (hz - panel.refresh_hz).abs() <= panel.refresh_hz * REFRESH_TOLERANCE;
         self.mode == panel.resolution && self.refresh_hz.is_none_or(rate_fits)
+    }
+
+    /// Whether YCbCr 4:4:4 is sent to it in place of RGB, by the connectors that are there: it is found among them by its
+    /// EDID, since display servers name connectors in their own ways.
+    pub fn gets_ycbcr_444(&self, there: &ConnectorList) -> bool {
+        self.edid.is_some() && there.0.iter().any(|seen| seen.edid == self.edid && seen.sends_ycbcr_444())
     }
 }
 
@@ -255,6 +261,7 @@ pub fn choose<'a>(there: &'a [Monitor], spec: &WindowSpec, panel: &PanelMonitor)
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::present::drm::SeenConnector;
     use proptest::prelude::*;
 
     const PANEL: PanelMonitor = PanelMonitor { resolution: Resolution { width: 1920, height: 1080 }, refresh_hz: 60.0 };
@@ -267,6 +274,7 @@ mod tests {
             name: Some(name.to_owned()),
             serial: Some(serial.to_owned()),
             native: None,
+            takes_ycbcr_444: false,
         })
     }
 
@@ -407,5 +415,22 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_monitor_that_gets_ycbcr_is_found_by_its_edid() {
+        let takes_it = |serial: &str| edid("PLUTO-2", serial).map(|edid| Edid { takes_ycbcr_444: true, ..edid });
+        let seen = |serial: &str| SeenConnector {
+            card: "/dev/dri/card0".into(),
+            driver: Some("amdgpu".to_owned()),
+            name: "HDMI-A-1".to_owned(),
+            connected: Some(true),
+            edid: takes_it(serial),
+        };
+        let there = ConnectorList(vec![seen("1"), seen("2")]);
+        assert!(Monitor { edid: takes_it("2"), ..monitor("HDMI-A-0") }.gets_ycbcr_444(&there));
+        assert!(!Monitor { edid: takes_it("3"), ..monitor("HDMI-A-1") }.gets_ycbcr_444(&there));
+        let nobody = ConnectorList(vec![SeenConnector { edid: None, ..seen("1") }]);
+        assert!(!Monitor { edid: None, ..monitor("HDMI-A-1") }.gets_ycbcr_444(&nobody));
     }
 }

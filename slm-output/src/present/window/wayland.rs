@@ -4,13 +4,13 @@
 //! What a compositor does not tell is not watched: its gamma ramps, power-saving, and notifications over a fullscreen
 //! window.
 
+use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use std::{fs, io};
 
 use holod_calibration::{Resolution, TimeNs, host_now};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -31,7 +31,7 @@ use super::watch::{Completion, Shown, Watched, Watcher};
 use super::{Draw, Opened, Wanted, WindowError};
 use crate::packing::PIXEL_BYTES;
 use crate::present::PanelFault;
-use crate::present::drm::Edid;
+use crate::present::drm::{Edid, SYS_CLASS_DRM, seen_connectors};
 
 /// How long the compositor may take to answer.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -327,6 +327,7 @@ impl Output {
             name: by_name(&self.model),
             serial: None,
             native: None,
+            takes_ycbcr_444: false,
         };
         Monitor {
             connector: self.connector.clone(),
@@ -350,11 +351,7 @@ impl Output {
 
 /// The EDID of a connector, whose name compositors take from the kernel.
 fn edid_of(connector: &str) -> Option<Edid> {
-    let cards = fs::read_dir("/sys/class/drm").ok()?;
-    let is_it =
-        |name: &str| name.split_once('-').is_some_and(|(card, rest)| card.starts_with("card") && rest == connector);
-    let folder = cards.flatten().find(|entry| entry.file_name().to_str().is_some_and(is_it))?;
-    Edid::parse(&fs::read(folder.path().join("edid")).ok()?)
+    seen_connectors(Path::new(SYS_CLASS_DRM)).0.into_iter().find(|seen| seen.name == connector)?.edid
 }
 
 impl View {
