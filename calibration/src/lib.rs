@@ -10,6 +10,7 @@ mod device;
 mod geometry;
 mod hangup;
 mod level_tables;
+pub mod lut_fit;
 mod png_bits;
 mod quantile;
 pub mod rig;

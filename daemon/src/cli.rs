@@ -57,6 +57,8 @@ pub enum Command {
     /// Draw a test pattern for the panel, say what is to be seen on the bench, show it.
     #[command(subcommand)]
     Pattern(PatternKind<PatternTarget>),
+    /// Make a panel's look-up table (lut_file) of powers that were measured with `holod pattern two-levels`.
+    Lut(LutArgs),
     /// Say what the running daemon is doing.
     Status(StatusArgs),
     /// Change what the running daemon does: scene, weights, pupil, eye, patterns, lasers, or read the rig file again.
@@ -79,6 +81,27 @@ pub enum Command {
     /// (`systemctl stop holod` keeps it from that). Lasers without a heartbeat (READYBeam, lasers that take commands in
     /// text) tell nobody: a holod that goes on may light them again. End it first.
     Dark(DarkArgs),
+}
+
+/// What a look-up table is made of.
+#[derive(Args, Debug, Clone)]
+pub struct LutArgs {
+    /// CSV, a row `level,power` for each level that was measured: the power of a first order of lines of level 0 and that
+    /// level, from 0 to the top level, in any unit.
+    #[arg(value_name = "FILE")]
+    pub powers: PathBuf,
+    /// The table to write, a row `level,phase_rad` for each level of the panel; - is standard output.
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Overwrite what is there already.
+    #[arg(long)]
+    pub force: bool,
+    /// The rig, whose panel has so many levels, with phases that rise or fall (phase_sign).
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Print what the table says as JSON.
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// What can be done with the laser box.

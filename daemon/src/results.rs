@@ -62,6 +62,11 @@ pub fn save_png(picture: impl Into<DynamicImage>, path: &Path) -> Result<(), Fai
     save(bytes.get_ref(), path)
 }
 
+/// Saves text.
+pub fn save_text(text: &str, path: &Path) -> Result<(), Failure> {
+    save(text.as_bytes(), path)
+}
+
 fn save(bytes: &[u8], path: &Path) -> Result<(), Failure> {
     let cannot = |error| Failure::new(Exit::CannotCreate, format!("{}: {error}", path.display()));
     write_atomically(path, |out| out.write_all(bytes)).map_err(cannot)

@@ -289,9 +289,7 @@ impl PanelEncoder {
     /// The index of the first of `levels` that the panel, or the table of `colour`, does not have: what phase it shows
     /// is not known.
     pub fn unknown_level(&self, colour: Colour, levels: &[u16]) -> Option<usize> {
-        let phases_rad = &self.colours[colour.index()].phase_of_level_rad;
-        let known = |level: u16| phases_rad.get(usize::from(level)).is_some_and(|phase_rad| phase_rad.is_finite());
-        levels.iter().position(|&level| !known(level))
+        levels.iter().position(|&level| self.phase_of_level(colour, level).is_none())
     }
 
     /// The phase in [0, 2π) that the panel really shows for `levels` `[panel height, panel width]`, with the panel's
@@ -333,6 +331,13 @@ impl PanelEncoder {
         let mut levels = vec![0; phases_rad.len()];
         encoder.encode_strided::<1>(phases_rad, None, &mut levels);
         levels.into_iter().map(|level| encoder.phase_of_level_rad[usize::from(level)]).collect()
+    }
+
+    /// The phase in radians, with its whole turns, that a flat panel shows at `level`; `None` where the panel, or the
+    /// table of `colour`, does not have it.
+    pub fn phase_of_level(&self, colour: Colour, level: u16) -> Option<f32> {
+        let phase_rad = self.colours[colour.index()].phase_of_level_rad.get(usize::from(level));
+        phase_rad.copied().filter(|phase_rad| phase_rad.is_finite())
     }
 
     /// The part of a panel's values that carries the pattern.

@@ -23,7 +23,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::fmt;
 
 use holod_calibration::rig::{PanelMode, Rig};
-use holod_calibration::{Colour, DisplayGeometry, Metres, PerColour};
+use holod_calibration::{Colour, DisplayGeometry, Metres, PerColour, Resolution};
 use serde::{Deserialize, Serialize};
 
 use crate::fields::LevelsFrame;
@@ -47,6 +47,13 @@ const ORDER_SAMPLES: usize = 4096;
 pub enum Pattern {
     /// One level everywhere, as it is: neither table nor flatness is applied.
     Level { level: u16 },
+    /// Upright lines of two levels, as they are, half a period each: sin² of half the phase between the levels is the
+    /// light in the first orders, from which a panel's look-up table is measured.
+    TwoLevels {
+        levels: [u16; 2],
+        /// Pixels across one line of each, even.
+        period_px: usize,
+    },
     /// Squares of two phases.
     Checkerboard {
         /// Pixels across two squares, even.
@@ -192,6 +199,9 @@ impl fmt::Display for Pattern {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::Level { level } => write!(f, "level {level} everywhere"),
+            Self::TwoLevels { levels: [first, second], period_px } => {
+                write!(f, "lines of the levels {first} and {second}, {period_px} px across both")
+            }
             Self::Checkerboard { period_px, depth_rad } => {
                 write!(f, "checkerboard, {period_px} px across two squares, {:.3} π deep", depth_rad / PI)
             }
@@ -239,15 +249,16 @@ impl Pattern {
                 placement.colours.iter().filter(|(_, drawn)| **drawn).map(|(colour, _)| colour.name()).collect();
             return Err(wrong("colour", named.join(","), format!("{only}: the panel shows {only} alone")));
         }
-        if let Self::Level { level } = *self {
+        if let Some((levels, half_px)) = self.bare_levels(&optics)? {
             let top = ((1u32 << frame.layout().packing.bit_depth()) - 1) as u16;
-            if level > top {
+            if let Some(level) = levels.into_iter().find(|&level| level > top) {
                 return Err(wrong("level", level.to_string(), format!("0 to {top}, the panel's levels")));
             }
             encoder.encode_flat(frame);
-            let levels = vec![level; encoder.panel_resolution().pixels()];
+            let Resolution { width, height } = encoder.panel_resolution();
+            let row: Vec<u16> = (0..width).map(|column| levels[column / half_px % 2]).collect();
             for (colour, _) in placement.colours.iter().filter(|(_, drawn)| **drawn) {
-                frame.field_mut(colour).write(&levels);
+                frame.field_mut(colour).write(&row.repeat(height));
             }
             return Ok(());
         }
@@ -261,10 +272,23 @@ impl Pattern {
         Ok(())
     }
 
+    /// The levels of a pattern that is none of phases, and the columns that each of them has in turn.
+    fn bare_levels(&self, optics: &DisplayGeometry) -> Result<Option<([u16; 2], usize)>, PatternError> {
+        match *self {
+            Self::Level { level } => Ok(Some(([level; 2], optics.resolution.width))),
+            Self::TwoLevels { levels, period_px } => {
+                checked_even_period(period_px, optics)?;
+                Ok(Some((levels, period_px / 2)))
+            }
+            _ => Ok(None),
+        }
+    }
+
     /// The phase in [0, 2π) of each pixel of `optics.resolution` in `colour`'s field, row-major from the upper left.
     ///
     /// # Errors
-    /// [`PatternError`] where it cannot be drawn on this bench, and for [`Pattern::Level`], which has no phases.
+    /// [`PatternError`] where it cannot be drawn on this bench, and for [`Pattern::Level`] and [`Pattern::TwoLevels`],
+    /// which have no phases.
     pub fn phase_rad(
         &self,
         axis_px: [f64; 2],
@@ -274,7 +298,9 @@ impl Pattern {
         let pitch_m = optics.pixel_pitch.0;
         let wavelength_m = optics.wavelengths[colour].0;
         match *self {
-            Self::Level { level } => Err(wrong("level", level.to_string(), "a pattern of phases".into())),
+            Self::Level { .. } | Self::TwoLevels { .. } => {
+                Err(wrong("kind", self.to_string(), "a pattern of phases".into()))
+            }
             Self::Checkerboard { period_px, depth_rad } => {
                 checked_checkerboard(period_px, depth_rad, optics)?;
                 let square_px = period_px / 2;
@@ -348,6 +374,20 @@ impl Pattern {
         };
         match *self {
             Self::Level { .. } => Ok(vec![order([0, 0], [0.0; 2], 1.0)]),
+            Self::TwoLevels { levels, period_px } => {
+                checked_even_period(period_px, optics)?;
+                let phase_rad = |level: u16| {
+                    let expected = format!("one that lut_file.{field} has; to measure it anew, take that file out");
+                    encoder.phase_of_level(field, level).ok_or_else(|| wrong("level", level.to_string(), expected))
+                };
+                let [first_rad, second_rad] = [phase_rad(levels[0])?, phase_rad(levels[1])?].map(f64::from);
+                let [field_m, laser_m] = [field, laser].map(|colour| optics.wavelengths[colour].0);
+                let half_rad = 0.5 * (second_rad - first_rad) * field_m / laser_m;
+                let per_px = 1.0 / period_px as f64;
+                let share = (2.0 / (period_px as f64 * (PI * per_px).sin()) * half_rad.sin()).powi(2);
+                let sides = [1, -1].map(|number| order([number, 0], [f64::from(number) * per_px, 0.0], share));
+                Ok(sides.into_iter().chain([order([0, 0], [0.0; 2], half_rad.cos().powi(2))]).collect())
+            }
             Self::Checkerboard { period_px, depth_rad } => {
                 checked_checkerboard(period_px, depth_rad, optics)?;
                 let shown_rad = shown_rad(&[0.0, depth_rad]);
@@ -533,8 +573,12 @@ fn checked_size(what: &'static str, found_px: usize, min_px: usize, max_px: usiz
 }
 
 fn checked_checkerboard(period_px: usize, depth_rad: f64, optics: &DisplayGeometry) -> Result<(), PatternError> {
-    checked_period(period_px as f64, optics)?;
     checked_depth(depth_rad)?;
+    checked_even_period(period_px, optics)
+}
+
+fn checked_even_period(period_px: usize, optics: &DisplayGeometry) -> Result<(), PatternError> {
+    checked_period(period_px as f64, optics)?;
     if period_px.is_multiple_of(2) {
         return Ok(());
     }
@@ -1007,6 +1051,57 @@ mod tests {
     }
 
     #[test]
+    fn two_levels_share_the_light_by_the_phase_between_them() {
+        // A stroke of 2·255/256 π: 64 levels are half a π.
+        for (levels, phase_rad) in
+            [([0, 0], 0.0), ([0, 64], 0.5 * PI), ([200, 72], PI), ([0, 255], TAU * 255.0 / 256.0)]
+        {
+            let pattern = Pattern::TwoLevels { levels, period_px: 32 };
+            let seen = shown(&pattern, &Placement::default(), SIZE, Colour::Green);
+            let told = orders(&pattern, Colour::Green, Colour::Green).unwrap();
+            let first: f64 = 4.0 / (PI * PI) * (0.5 * phase_rad).sin().powi(2);
+            assert!((told[0].share - first).abs() < 4e-3, "{levels:?}: {told:?}");
+            for order in &told {
+                let per_px = order.number.map(|number| f64::from(number) / 32.0);
+                let share = share_at(&seen, SIZE, per_px) * envelope(per_px);
+                assert!((order.share - share).abs() < 1e-4, "{levels:?}: {order:?}, drawn {share}");
+            }
+        }
+        let blue_light = orders(&Pattern::TwoLevels { levels: [0, 64], period_px: 32 }, Colour::Green, Colour::Blue);
+        let phase_rad: f64 = 0.5 * PI * 520.0 / 450.0;
+        let first = 4.0 / (PI * PI) * (0.5 * phase_rad).sin().powi(2);
+        assert!((blue_light.unwrap()[0].share - first).abs() < 4e-3);
+    }
+
+    #[test]
+    fn two_levels_are_sent_as_they_are() {
+        let mut panel = Rig::default().panel;
+        let size = Resolution { width: 6, height: 2 };
+        panel.flatness_rad[Colour::Red] = Some(vec![1.0; size.pixels()]);
+        let encoder = PanelEncoder::new(&panel, size, size).unwrap();
+        let mut frame = LevelsFrame::new(FrameLayout::new(&panel, size));
+        let mut draw = |levels: [u16; 2], period_px: usize| {
+            let pattern = Pattern::TwoLevels { levels, period_px };
+            pattern.draw(&Placement::default(), &encoder, &BENCH, &mut frame).map_err(|error| error.to_string())
+        };
+        let refused = |drawn: Result<(), String>| drawn.unwrap_err();
+        assert_eq!(refused(draw([0, 256], 4)), "the pattern's level is 256; expected 0 to 255, the panel's levels");
+        assert!(refused(draw([0, 9], 3)).ends_with("expected an even number of pixels"));
+        draw([3, 250], 4).unwrap();
+        assert_eq!(frame.unpack_colour(Colour::Red).levels, [3, 3, 250, 250, 3, 3].repeat(2));
+    }
+
+    #[test]
+    fn a_level_without_a_phase_says_how_it_is_measured() {
+        let mut rig = Rig::default();
+        let level = |level: u16| LevelPhase { level, phase_rad: f64::from(level) * TAU / 64.0 };
+        rig.panel.lut[Colour::Green] = Some([0, 16, 32, 48].map(level).to_vec());
+        let lines = Pattern::TwoLevels { levels: [0, 17], period_px: 32 };
+        let error = orders_on(&rig, &lines, Colour::Green, Colour::Green).unwrap_err().to_string();
+        assert!(error.contains("level is 17") && error.contains("take that file out"), "{error}");
+    }
+
+    #[test]
     fn an_axis_off_the_panel_is_refused() {
         let lens = Pattern::Lens { focal_length: Metres(0.3), diameter: None };
         let encoder = PanelEncoder::new(&Rig::default().panel, BENCH.resolution, BENCH.resolution).unwrap();
@@ -1047,6 +1142,10 @@ mod tests {
             (
                 r#"{"kind":"lens","focal_length_m":0.3,"diameter_m":0.002}"#,
                 Pattern::Lens { focal_length: Metres(0.3), diameter: Some(Metres(0.002)) },
+            ),
+            (
+                r#"{"kind":"two-levels","levels":[0,128],"period_px":32}"#,
+                Pattern::TwoLevels { levels: [0, 128], period_px: 32 },
             ),
             (r#"{"kind":"field-identity","radius_m":0.0005}"#, Pattern::FieldIdentity { radius: Some(Metres(5e-4)) }),
             (

@@ -9,6 +9,7 @@ mod feed;
 mod focal_stack;
 mod gpu;
 mod inspect;
+mod lut;
 mod page;
 mod panel;
 mod pattern;

@@ -22,6 +22,22 @@ pub enum PatternKind<To: Args> {
         #[command(flatten)]
         to: To,
     },
+    /// Upright lines of two levels, as they are: without look-up table and flatness. The light in the first order tells
+    /// the phase between the levels (`holod lut`).
+    TwoLevels {
+        /// One level.
+        #[arg(value_name = "LEVEL")]
+        first: u16,
+        /// The other one.
+        #[arg(value_name = "LEVEL")]
+        second: u16,
+        /// Pixels across one line of each.
+        #[arg(long, value_name = "PX", default_value_t = 32)]
+        period: usize,
+        /// Where to.
+        #[command(flatten)]
+        to: To,
+    },
     /// Squares of two phases: with π between them no light is left in the middle.
     Checkerboard {
         /// Pixels across two squares; 2 sends all light beyond the relay's stop.
@@ -103,6 +119,7 @@ impl<To: Args> PatternKind<To> {
     pub fn target(&self) -> &To {
         match self {
             Self::Level { to, .. }
+            | Self::TwoLevels { to, .. }
             | Self::Checkerboard { to, .. }
             | Self::Grating { to, .. }
             | Self::Lens { to, .. }
@@ -119,6 +136,9 @@ impl<To: Args> From<&PatternKind<To>> for Pattern {
         let metres = |mm: f64| Metres(mm / 1e3);
         match *kind {
             PatternKind::Level { level, .. } => Self::Level { level },
+            PatternKind::TwoLevels { first, second, period, .. } => {
+                Self::TwoLevels { levels: [first, second], period_px: period }
+            }
             PatternKind::Checkerboard { period, depth, .. } => {
                 Self::Checkerboard { period_px: period, depth_rad: depth * PI }
             }

@@ -9,6 +9,7 @@ mod focal_stack;
 mod hologram_files;
 mod laser;
 mod log;
+mod lut;
 mod pattern;
 mod render;
 mod report;
@@ -37,6 +38,7 @@ pub fn dispatch(cli: Cli) -> Result<(), Failure> {
         Some(Command::Bench(args)) => bench::bench(&args),
         Some(Command::Evaluate(args)) => evaluate::evaluate(&args),
         Some(Command::Pattern(kind)) => pattern::pattern(&kind),
+        Some(Command::Lut(args)) => lut::lut(&args),
         Some(Command::Status(args)) => status::status(&args),
         Some(Command::Ctl(args)) => ctl::ctl(&args),
         Some(Command::Report(args)) => report::report(&args),

@@ -66,6 +66,11 @@ impl Sight {
         let mut notes = Vec::new();
         match *pattern {
             Pattern::Level { .. } => notes.push("no pattern of phases: all light stays in the middle".into()),
+            Pattern::TwoLevels { .. } => notes.push(
+                "measure the power of one first order, behind a hole that keeps the middle away: it is largest where the \
+                 levels are π apart, and least where they are 0 or 2π apart; `holod lut` makes the table of it"
+                    .into(),
+            ),
             Pattern::Checkerboard { .. } => notes.push(
                 "turn --depth until the middle is darkest: there the panel's own depth is π, and any other figure is the \
                  stroke's error"
