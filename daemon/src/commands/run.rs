@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use holod_calibration::Resolution;
 use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_pupil_input::{RecordFiles, ReplaySpeed, Tracker, TrackerSpec};
 use holod_slm_output::OutputSpec;
@@ -20,7 +21,7 @@ use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, RecordFolder, RecordHealth, Recorder};
 use crate::service_lasers::ServiceLasers;
-use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
+use crate::session::{self, Hangups, SessionPlan, SessionReport, ShownLevels, Summary, not_dark};
 use crate::{results, run_text, setup, source};
 
 /// Scenario of the built-in tracker.
@@ -287,19 +288,47 @@ fn finish_record(session: &Arc<SessionReport>, folder: &Path, health: &Arc<Recor
     Ok(())
 }
 
+/// `summary.json` of a record.
+#[derive(Serialize)]
+struct RecordSummary<'a> {
+    #[serde(flatten)]
+    summary: &'a Summary,
+    shown_levels: Vec<KeptLevels>,
+}
+
+/// A picture of levels in a record, and what turns it into what an eye saw.
+#[derive(Serialize)]
+struct KeptLevels {
+    file: String,
+    frame: u64,
+    pupil_mm: f32,
+    /// The amplitude that double phase took as 1.
+    amplitude_constant: f32,
+    /// Size of the hologram in the middle of the panel.
+    hologram: [usize; 2],
+}
+
 /// Saves the levels first: the summary says whether they are there.
 fn save(session: &SessionReport, folder: &Path, health: &RecordHealth) {
     let cannot = |failure: Failure| health.give_up(&format!("cannot finish it: {failure}"));
-    save_shown(session, folder).unwrap_or_else(cannot);
+    let shown_levels = save_shown(session, folder).unwrap_or_else(|failure| {
+        cannot(failure);
+        Vec::new()
+    });
     let mut summary = session.summary.clone();
     summary.figures.record = Some(health.state());
+    let summary = RecordSummary { summary: &summary, shown_levels };
     results::save_json(&summary, &folder.join("summary.json")).unwrap_or_else(cannot);
 }
 
-fn save_shown(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
-    for (pupil, levels) in &session.shown {
-        let name = record::shown_name(pupil.mm(), levels.tag().frame_id);
-        results::save_png(levels_picture(levels), &folder.join(name))?;
-    }
-    Ok(())
+fn save_shown(session: &SessionReport, folder: &Path) -> Result<Vec<KeptLevels>, Failure> {
+    let Resolution { width, height } = session.encoder.pattern_resolution();
+    let save = |shown: &ShownLevels| {
+        let (frame, pupil_mm) = (shown.levels.tag().frame_id, shown.pupil.mm());
+        let file = record::shown_name(pupil_mm, frame);
+        results::save_png(levels_picture(&shown.levels), &folder.join(&file))?;
+        let amplitude_constant = shown.amplitude_constant;
+        Ok(KeptLevels { file, frame, pupil_mm, amplitude_constant, hologram: [width, height] })
+    };
+    session.shown.iter().map(save).collect()
 }
