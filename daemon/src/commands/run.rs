@@ -146,6 +146,7 @@ pub(super) fn judge(args: &RunArgs, rig: &Rig) -> Result<(), Failure> {
     let rig = with_options(rig.clone(), args);
     let spec = rig.tracker.spec.as_deref().unwrap_or(SAMPLE_TRACKER);
     let spec: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
+    setup::refuse_port_of_others(&spec, &rig)?;
     if spec.files().iter().all(|file| file.exists()) {
         Tracker::examine(&spec, &rig.tracker).map_err(setup::tracker_failure)?;
     }
@@ -331,4 +332,26 @@ fn save_shown(session: &SessionReport, folder: &Path) -> Result<Vec<KeptLevels>,
         Ok(KeptLevels { file, frame, pupil_mm, amplitude_constant, hologram: [width, height] })
     };
     session.shown.iter().map(save).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use holod_calibration::rig::LaserDriver;
+
+    use super::*;
+    use crate::cli::Cli;
+
+    #[test]
+    fn what_a_run_would_refuse_is_refused_before_there_is_one() {
+        let mut rig = Rig::default();
+        rig.lasers.driver = LaserDriver::Serial { path: "/dev/null".into(), sync_wire: false };
+        rig.tracker.spec = Some("serial:/dev/null".into());
+        let judged = |more: &[&str]| {
+            let cli = Cli::try_parse_from([&["holod"], more].concat()).unwrap();
+            judge(&cli.run, &rig).map_err(|failure| failure.to_string())
+        };
+        assert!(judged(&[]).unwrap_err().contains("/dev/null that the rig names for its lasers"));
+        assert_eq!(judged(&["--tracker", "mock:steady"]), Ok(()));
+    }
 }
