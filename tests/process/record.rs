@@ -153,3 +153,18 @@ fn levels_of_ten_bits_are_recorded_whole_with_what_their_hologram_was_made_with(
     let highest = levels.pixels().flat_map(|pixel| pixel.0).max().unwrap();
     assert!((900..1024).contains(&highest), "{highest}");
 }
+
+#[test]
+fn a_bench_is_rehearsed_with_simulated_lasers_in_place_of_its_own() {
+    let bench = bench();
+    let real = holod_tests::small_rig(64, 64, "driver = \"serial\"\ndevice = \"/dev/holod-none\"\nsync_wire = true");
+    fs::write(bench.path().join("rig.toml"), real).unwrap();
+    let simulated = ["--lasers", "simulated", "--frames", "60", "--json"];
+    let ended = run(HOLOD, &[&ARGS[..], &simulated].concat(), bench.path());
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let summary: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+    assert!(summary["lasers"]["lit"].as_u64() > Some(60), "{summary:#}");
+    let ended = run(HOLOD, &[&ARGS[..], &simulated, &NO_PANEL].concat(), bench.path());
+    assert_eq!(ended.status.code(), Some(64), "{}", ended.stderr);
+    assert!(ended.stderr.contains("found --output drm:DP-99, expected headless"), "{}", ended.stderr);
+}
