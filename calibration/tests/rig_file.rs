@@ -1105,6 +1105,20 @@ fn a_faulty_lut_names_its_file_and_row() {
     assert!(turns.contains("in radians: multiply turns by 2π, multiples of π by π"), "{turns}");
     assert_lut_fault(&lut_csv(|level| -straight(level)), "-1.992 π", "a rising table");
     assert_lut_fault(&lut_csv(|level| straight(level) * 1.03), "2.052 π", "1.992 π that stroke_pi states");
+    for (unit_rad, cure) in
+        [(PI, "like multiples of π: multiply them by 3.14159"), (TAU, "like turns: multiply them by 6.28319")]
+    {
+        // Of a stroke of 3.98 π the turns are a range of radians that a table may have.
+        let stroke_pi = 1.9921875 * unit_rad / PI;
+        let text = changed(&[
+            ("settle_ms", "lut_file.green = \"green.csv\"\nsettle_ms"),
+            ("green = 1.9921875", &format!("green = {stroke_pi}")),
+        ]);
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("green.csv"), lut_csv(|level| straight(level) / PI)).unwrap();
+        let refused = Rig::parse(&text, &folder.path().join("rig.toml")).unwrap_err().to_string();
+        assert!(refused.contains(cure) && !refused.contains("take stroke_pi out"), "{refused}");
+    }
     assert_lut_fault(&good.replace(',', ";"), "and 253 rows more", "");
     let missing = load_with_file("lut_file", "green.csv", |_| ()).unwrap_err();
     assert!(missing.to_string().contains("green.csv: No such file"), "{missing}");

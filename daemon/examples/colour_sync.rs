@@ -16,7 +16,7 @@ use holod_daemon::exposure::{Exposure, PatternOnPanel};
 use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::pictures::{Sheet, Tile, screen_picture};
 use holod_daemon::results;
-use holod_daemon::session::{self, Observer, SessionPlan};
+use holod_daemon::session::{self, Observer, SessionPlan, ShownLevels};
 use holod_daemon::source::Pictures;
 use holod_daemon::source::scene::{self, Frames};
 use holod_model::Weights;
@@ -86,7 +86,7 @@ fn run(out: &Path) -> Result<(), Failure> {
     let mut fields = Fields::default();
     let session = session::run(plan, &mut fields)?;
     let nothing = |what| Failure::new(Exit::Unavailable, format!("{what} within {DURATION:?}: give the machine rest"));
-    let (pupil, levels) = session.shown.last().ok_or_else(|| nothing("no frame was shown"))?;
+    let ShownLevels { pupil, levels, .. } = session.shown.last().ok_or_else(|| nothing("no frame was shown"))?;
 
     // A colour frame of these levels that was lit throughout, the field before it and the one after it.
     let of_frame = |event: &FieldEvent| event.frame_id == levels.tag().frame_id;

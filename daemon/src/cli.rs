@@ -304,6 +304,10 @@ pub struct RunArgs {
                 desktop), or window:MONITOR[,allow_primary] (a window that covers a monitor of the desktop)"
     )]
     pub output: String,
+    /// Lasers in place of the rig's own, with --output headless: a bench's rig is rehearsed as it is, without its laser
+    /// box.
+    #[arg(long, value_enum, value_name = "LASERS")]
+    pub lasers: Option<LasersInstead>,
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
@@ -340,6 +344,13 @@ pub struct RunArgs {
     /// Print the summary as JSON.
     #[arg(long)]
     pub json: bool,
+}
+
+/// Lasers that may take the place of the rig's.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LasersInstead {
+    /// Nothing is lit; what a laser box would do is computed.
+    Simulated,
 }
 
 /// Where the status page is served.

@@ -146,6 +146,28 @@ pub fn ports_of_others(rig: &Rig) -> Vec<PathBuf> {
     rig.lasers.driver.paths().into_iter().map(Path::to_path_buf).collect()
 }
 
+/// Refuses a tracker at a port of [`ports_of_others`], which a run would not open.
+///
+/// # Errors
+/// It is one.
+pub(crate) fn refuse_port_of_others(spec: &TrackerSpec, rig: &Rig) -> Result<(), Failure> {
+    let (TrackerSpec::Path(path) | TrackerSpec::Serial { path, .. }) = spec else { return Ok(()) };
+    let resolved = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let port = resolved(path);
+    match ports_of_others(rig).into_iter().find(|owner| resolved(owner) == port) {
+        None => Ok(()),
+        Some(owner) => Err(Failure::new(
+            Exit::NoInput,
+            format!(
+                "tracker port {} is the port {} that the rig names for its lasers; name the tracker's own port, which `holod \
+                 tracker list` shows",
+                path.display(),
+                owner.display()
+            ),
+        )),
+    }
+}
+
 /// The exit code of a tracker that cannot be started.
 pub(crate) fn tracker_failure(error: TrackerError) -> Failure {
     let exit = match &error {
@@ -160,4 +182,31 @@ pub(crate) fn tracker_failure(error: TrackerError) -> Failure {
         TrackerError::Thread(_) => Exit::Unavailable,
     };
     Failure::because(exit)(error)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use holod_calibration::rig::LaserDriver;
+
+    use super::*;
+
+    #[test]
+    fn the_port_of_the_lasers_is_no_trackers() {
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("holod-lasers");
+        symlink("/dev/null", &link).unwrap();
+        let mut rig = Rig::default();
+        let refused = |rig: &Rig, spec: &str| refuse_port_of_others(&spec.parse().unwrap(), rig).is_err();
+        assert!(!refused(&rig, "/dev/null"));
+        for lasers in [link, "/dev/null".into()] {
+            rig.lasers.driver = LaserDriver::Serial { path: lasers, sync_wire: false };
+            assert!(refused(&rig, "/dev/null") && refused(&rig, "serial:/dev/null,profile=holod"));
+            assert!(!refused(&rig, "/dev/zero") && !refused(&rig, "mock"));
+        }
+        // Elsewhere, where neither is plugged in.
+        rig.lasers.driver = LaserDriver::Serial { path: "/dev/holod-none".into(), sync_wire: false };
+        assert!(refused(&rig, "serial:/dev/holod-none"));
+    }
 }

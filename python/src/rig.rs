@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use holod_calibration::rig::{self as calibration, WeightsChoice};
 use holod_calibration::{Colour, Dioptres, PerColour, Resolution};
 use holod_daemon::failure::{Exit, Failure};
+use holod_daemon::pictures::read_levels;
 use holod_daemon::{renderer, setup};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use pyo3::prelude::*;
@@ -195,6 +196,21 @@ impl Rig {
             Ok(fields.flat_map(|(colour, field)| encoder.decode_pattern(colour, field)).collect::<Vec<f32>>())
         })?;
         array(py, phases, [3, resolution.height, resolution.width])
+    }
+
+    /// The levels of a picture in a record, `shown_pupil_*.png`, of a run of this rig: (3, height_px, width_px), as
+    /// `levels_of` returns them and `phase_of` takes them.
+    ///
+    /// Raises InputError for what is no such picture of this rig's panel.
+    fn read_levels<'py>(&self, py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, PyAny>> {
+        let panel = self.rig.resolution();
+        let fields = without_lock(py, || read_levels(&path, &self.rig.panel, panel))?;
+        let levels = fields.0.into_iter().flatten();
+        if self.rig.panel.bit_depth == 8 {
+            array(py, levels.map(|level| level as u8).collect(), levels_shape(panel))
+        } else {
+            array(py, levels.collect(), levels_shape(panel))
+        }
     }
 
     fn __repr__(&self) -> String {

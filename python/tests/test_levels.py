@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import holod
 import numpy as np
@@ -133,6 +134,30 @@ def test_levels_are_those_that_a_run_sends_to_its_panel(daemon: Daemon) -> None:
     given = {"colour": scene.colour, "depth_unit": scene.depth_unit}
     assert np.array_equal(renderer.render(scene.rgb, scene.depth, 3.0, **given).levels, expected)
     assert not np.array_equal(renderer.render(scene.rgb, scene.depth, 3.01, **given).levels, expected)
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+def test_levels_in_a_record_are_read_and_looked_at_as_its_page_says(daemon: Daemon, bits: int) -> None:
+    text = RIG if bits == 8 else RIG.replace("bit_depth = 8", 'bit_depth = 10\npacking = "gray10"')
+    (daemon.folder / "rig.toml").write_text(text)
+    size = ["--resolution", "80x60", "--pupil", "3"]
+    daemon.run("run", "--config", "rig.toml", *size, "--frames", "3", "--record", "run1", *OPTIONS)
+    rig = holod.Rig.load(daemon.folder / "rig.toml")
+    renderer = holod.Renderer(rig, "fast", width_px=80, height_px=60, backend="cpu")
+    scene = holod.builtin_scene(80, 60)
+    hologram = renderer.render(scene.rgb, scene.depth, 3.0, colour=scene.colour, depth_unit=scene.depth_unit)
+    (recorded,) = (daemon.folder / "run1").glob("shown_pupil_*.png")
+    levels = rig.read_levels(recorded)
+    assert levels.dtype == (np.uint8 if bits == 8 else np.uint16)
+    assert np.array_equal(levels, hologram.levels)
+
+    page = (Path(__file__).parents[2] / "daemon/doc/record.md").read_text()
+    code = page.split("```python\n")[1].split("```")[0].replace("run1/", f"{daemon.folder}/run1/")
+    made: dict[str, Any] = {}
+    exec(code, made)
+    assert np.array_equal(made["seen"], hologram.view(2.5))
+    with pytest.raises(holod.InputError, match="expected one of 1920x1080 with 3 of 8"):
+        holod.Rig.builtin().read_levels(recorded)
 
 
 def test_levels_and_phases_lead_to_each_other(renderer: holod.Renderer, scene: holod.Scene) -> None:

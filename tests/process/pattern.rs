@@ -110,6 +110,12 @@ fn a_pattern_on_a_panel_is_lit_by_each_fields_own_laser_or_stays_dark() {
     }
     assert!(lit.stdout.contains("lasers dark at the end: true; flat pattern on the panel: true"), "{}", lit.stdout);
 
+    let green = pattern(folder.path(), &rig(), "level 40 --colour green --output headless --duration 1s");
+    assert!(green.status.success(), "{}", green.stderr);
+    assert!(green.stdout.contains("- --output shows it with no light of red and blue"), "{}", green.stdout);
+    assert_eq!(green.stdout.matches(" fields, its laser without power").count(), 2, "{}", green.stdout);
+    assert_eq!(green.stdout.matches(" of them lit").count(), 1, "{}", green.stdout);
+
     let dark = pattern(folder.path(), &rig(), "field-identity --output headless --duration 500ms --dark");
     assert!(dark.status.success(), "{}", dark.stderr);
     assert_eq!(dark.stdout.matches(" fields, 0 of them lit").count(), 3, "{}", dark.stdout);

@@ -133,3 +133,38 @@ fn a_record_that_is_being_written_is_refused_and_goes_on() {
     assert!(bench.path().join("record/summary.json").exists());
     assert!(record(bench.path(), &["--frames", "5", "--force"]).status.success());
 }
+
+#[test]
+fn levels_of_ten_bits_are_recorded_whole_with_what_their_hologram_was_made_with() {
+    let bench = bench();
+    let rig = fs::read_to_string(bench.path().join("rig.toml")).unwrap();
+    let rig = rig.replace("channel-packed", "field-sequential").replace("refresh_hz = 60.0", "refresh_hz = 180.0");
+    let rig = rig.replace("bit_depth = 8", "bit_depth = 10\npacking = \"red8-blue2\"");
+    fs::write(bench.path().join("rig.toml"), rig).unwrap();
+    let ended = record(bench.path(), &["--frames", "5", "--pupil", "3"]);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let text = fs::read_to_string(bench.path().join("record/summary.json")).unwrap();
+    let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let [kept] = &summary["shown_levels"].as_array().unwrap()[..] else { panic!("{summary:#}") };
+    assert_eq!(kept["hologram"], serde_json::json!([16, 16]));
+    assert_eq!(kept["amplitude_constant"], 1.25, "that of the built-in networks");
+    let file = bench.path().join("record").join(kept["file"].as_str().unwrap());
+    let image::DynamicImage::ImageRgb16(levels) = image::open(file).unwrap() else { panic!("it has not 16 bits") };
+    let highest = levels.pixels().flat_map(|pixel| pixel.0).max().unwrap();
+    assert!((900..1024).contains(&highest), "{highest}");
+}
+
+#[test]
+fn a_bench_is_rehearsed_with_simulated_lasers_in_place_of_its_own() {
+    let bench = bench();
+    let real = holod_tests::small_rig(64, 64, "driver = \"serial\"\ndevice = \"/dev/holod-none\"\nsync_wire = true");
+    fs::write(bench.path().join("rig.toml"), real).unwrap();
+    let simulated = ["--lasers", "simulated", "--frames", "60", "--json"];
+    let ended = run(HOLOD, &[&ARGS[..], &simulated].concat(), bench.path());
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let summary: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+    assert!(summary["lasers"]["lit"].as_u64() > Some(60), "{summary:#}");
+    let ended = run(HOLOD, &[&ARGS[..], &simulated, &NO_PANEL].concat(), bench.path());
+    assert_eq!(ended.status.code(), Some(64), "{}", ended.stderr);
+    assert!(ended.stderr.contains("found --output drm:DP-99, expected headless"), "{}", ended.stderr);
+}

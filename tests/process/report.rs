@@ -160,6 +160,11 @@ fn a_run_that_is_packed_and_sent_is_shown_again_to_the_byte() {
     let unzipped = Command::new("gzip").args(["-dc"]).stdin(fs::File::open(sent.path()).unwrap()).output().unwrap();
     fs::write(&plain, unzipped.stdout).unwrap();
     assert_all_the_same(&run(HOLOD, &["run", "--tracker", "plain", "--json"], sent.0.path()));
+    let checked = run(HOLOD, &["check", "--tracker", "plain", "--weights", "fast", "--json"], sent.0.path());
+    let found: Value = serde_json::from_str(&checked.stdout).unwrap();
+    let tracker = found["checks"].as_array().unwrap().iter().find(|check| check["name"] == "tracker").unwrap();
+    assert_eq!(tracker["passed"], true, "{tracker}");
+    assert!(tracker["says"].as_str().unwrap().contains("plain: a report, which brings its own rig"), "{tracker}");
     let recorded = run(HOLOD, &["--tracker", "plain", "--record", "again"], sent.0.path());
     assert_eq!(recorded.status.code(), Some(64), "{}", recorded.stderr);
     assert!(recorded.stderr.contains("--record: a report holds its record already"), "{}", recorded.stderr);

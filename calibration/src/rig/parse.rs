@@ -1,7 +1,7 @@
 //! From a rig file's text to a [`Rig`].
 
 use std::collections::BTreeSet;
-use std::f64::consts::PI;
+use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
 use super::files::{plain_file, read_text};
@@ -561,9 +561,17 @@ fn check_lut<'a>(
         return;
     }
     let found = format!("a table whose phase goes by {} π from the lowest level to the highest", shown(range_pi));
-    if let Some(stroke) = stroke_pi.filter(|stroke| (range_pi.abs() / stroke.value - 1.0).abs() > STROKE_TOLERANCE) {
+    let is_stroke = |range_pi: f64, stroke_pi: f64| (range_pi.abs() / stroke_pi - 1.0).abs() <= STROKE_TOLERANCE;
+    if let Some(stroke) = stroke_pi.filter(|stroke| !is_stroke(range_pi, stroke.value)) {
         let expected = format!("the {} π that stroke_pi states", shown(stroke.value));
-        reader.fault_in(panel, key, line, &found, &expected, "take stroke_pi out: the table says it".into());
+        let other_unit = [("multiples of π", PI), ("turns", TAU)]
+            .into_iter()
+            .find(|(_, unit_rad)| is_stroke(range_pi * unit_rad, stroke.value));
+        let advice = match other_unit {
+            Some((unit, unit_rad)) => format!("its phases look like {unit}: multiply them by {unit_rad:.5}"),
+            None => "take stroke_pi out: the table says it".into(),
+        };
+        reader.fault_in(panel, key, line, &found, &expected, advice);
     }
     let TableRange::Signed(range_rad) = range else { return };
     let (expected, other) = match sign {

@@ -161,7 +161,8 @@ impl<To: Args> From<&PatternKind<To>> for Pattern {
 /// Where a pattern is on the panel.
 #[derive(Args, Debug, Clone)]
 pub struct PatternPlace {
-    /// Colours that have the pattern, the others are flat; all of them when left out.
+    /// Colours that have the pattern, the others are flat; all of them when left out. `holod pattern` keeps the lasers of
+    /// the others dark, a run (`holod ctl pattern`) lights them.
     #[arg(long, value_enum, value_name = "COLOUR", num_args = 1.., value_delimiter = ',')]
     pub colour: Vec<ColourArg>,
     /// The optical axis in pixels from the panel's centre, right and up: the middle of lens, dots and cross-hair.
@@ -192,7 +193,7 @@ pub struct PatternTarget {
     /// Overwrite files that are there already.
     #[arg(long)]
     pub force: bool,
-    /// Show it, as after `run --output`, with each field's own laser lit.
+    /// Show it, as after `run --output`, with each field's own laser lit, of the colours that have the pattern.
     #[arg(long, value_name = "SPEC")]
     pub output: Option<String>,
     /// Show it for so long, for example 10s; until a signal comes when left out.

@@ -16,6 +16,7 @@ use holod_model::weights::{Architecture, JudgedBench};
 use holod_pupil_input::{Tracker, TrackerSpec, serial_port_warnings};
 use serde::Serialize;
 
+use crate::bug_report;
 use crate::cli::{Backend, CheckArgs};
 use crate::failure::{Exit, Failure};
 use crate::source::scene;
@@ -246,15 +247,30 @@ fn tracker(rig: &Rig) -> Check {
     };
     let (passed, says) = match spec.parse::<TrackerSpec>() {
         Err(error) => (false, error.to_string()),
-        Ok(spec) => match reachable(&spec) {
-            (true, says) => match Tracker::examine(&spec, &rig.tracker) {
-                Ok(()) => (true, says),
-                Err(error) => (false, error.to_string()),
-            },
-            not_there => not_there,
-        },
+        Ok(spec) => examine(&spec, rig),
     };
     Check { name, passed, says }
+}
+
+fn examine(spec: &TrackerSpec, rig: &Rig) -> (bool, String) {
+    if let Err(failure) = setup::refuse_port_of_others(spec, rig) {
+        return (false, failure.to_string());
+    }
+    if let TrackerSpec::Path(path) | TrackerSpec::Replay { path, .. } = spec
+        && bug_report::is_archive(path)
+    {
+        return match progress::during("unpacking the report", || bug_report::unpack(path)) {
+            Ok(_) => (true, format!("{}: a report, which brings its own rig, weights and scene", path.display())),
+            Err(failure) => (false, failure.to_string()),
+        };
+    }
+    match reachable(spec) {
+        (true, says) => match Tracker::examine(spec, &rig.tracker) {
+            Ok(()) => (true, says),
+            Err(error) => (false, error.to_string()),
+        },
+        not_there => not_there,
+    }
 }
 
 /// Whether the tracker is there, as far as that can be told without opening it.
@@ -298,6 +314,8 @@ fn present(path: &Path, otherwise: &str) -> (bool, String) {
 
 #[cfg(test)]
 mod tests {
+    use holod_calibration::rig::LaserDriver;
+
     use super::*;
 
     #[test]
@@ -312,6 +330,16 @@ mod tests {
             let (passed, says) = reachable(&spec.parse().unwrap());
             assert!(!passed && says.contains("none") && says.contains(cure), "{spec}: {says}");
         }
+    }
+
+    #[test]
+    fn a_tracker_at_the_lasers_port_is_a_fault_of_the_bench() {
+        let mut rig = Rig::default();
+        rig.tracker.spec = Some("serial:/dev/null".into());
+        assert!(tracker(&rig).passed, "{}", tracker(&rig).says);
+        rig.lasers.driver = LaserDriver::Serial { path: "/dev/null".into(), sync_wire: false };
+        let Check { passed, says, .. } = tracker(&rig);
+        assert!(!passed && says.contains("/dev/null that the rig names for its lasers"), "{says}");
     }
 
     #[test]

@@ -9,7 +9,7 @@ use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
 use holod_model::{LinearImage, RgbdFrame, metrics};
 use holod_pupil_input::{Decision, MOCK_SEED, MockSource, Scenario, TrackerSpec, Verdict};
 use holod_slm_output::present::ReportFaults;
-use holod_slm_output::{FieldEvent, LevelsFrame, OutputSpec};
+use holod_slm_output::{FieldEvent, OutputSpec};
 
 use crate::cli::{Backend, DemoArgs, RigArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
@@ -17,7 +17,7 @@ use crate::pictures::{
     Area, LatencyPlot, PupilPlot, PupilSampleMark, Sheet, Tile, phase_picture, screen_picture, shown_pattern,
 };
 use crate::record::{FieldRecord, FrameLog, FrameRecord};
-use crate::session::{self, FirstLight, Observer, SessionPlan, SessionReport};
+use crate::session::{self, FirstLight, Observer, SessionPlan, SessionReport, ShownLevels};
 use crate::source::{Pictures, scene};
 use crate::staging::Staging;
 use crate::{logging, progress, results, run_text, setup};
@@ -91,15 +91,15 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
     logging::say("computing what an eye sees of the recorded panel levels");
     let views: Vec<EyeView> = progress::during("computing what the eye sees", || {
         let mut eye = SimulatedEye::new(&geometry, scene.resolution);
-        let of_frame = |(pupil, levels): &(PupilDiameter, LevelsFrame)| {
-            let pattern = shown_pattern(&session.encoder, levels);
-            [NEAR, FAR].map(|focus| EyeView::new(&mut eye, &pattern, constant, *pupil, focus, &scene))
+        let of_frame = |shown: &ShownLevels| {
+            let pattern = shown_pattern(&session.encoder, &shown.levels);
+            [NEAR, FAR].map(|focus| EyeView::new(&mut eye, &pattern, constant, shown.pupil, focus, &scene))
         };
-        let frames = if narrow.0 == wide.0 { vec![wide] } else { vec![narrow, wide] };
+        let frames = if narrow.pupil == wide.pupil { vec![wide] } else { vec![narrow, wide] };
         frames.into_iter().flat_map(of_frame).collect()
     });
     results::save_png(eye_sheet(&views).draw(), &staging.path("eye.png"))?;
-    let pattern = shown_pattern(&session.encoder, &wide.1);
+    let pattern = shown_pattern(&session.encoder, &wide.levels);
     for colour in Colour::ALL {
         results::save_png(phase_picture(&pattern, colour), &staging.path(&format!("phase_{colour}.png")))?;
     }

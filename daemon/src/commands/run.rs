@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use holod_calibration::rig::{Rig, WeightsChoice};
+use holod_calibration::rig::{LaserDriver, Lasers, Rig, WeightsChoice};
+use holod_calibration::{Colour, Resolution};
 use holod_pupil_input::{RecordFiles, ReplaySpeed, Tracker, TrackerSpec};
 use holod_slm_output::OutputSpec;
 use serde::Serialize;
@@ -12,7 +13,7 @@ use serde::Serialize;
 use super::check::access::files_of;
 use crate::aside;
 use crate::bug_report::{self, Outcome, Played};
-use crate::cli::{FitArg, RunArgs};
+use crate::cli::{FitArg, LasersInstead, RunArgs};
 use crate::control::RigReader;
 use crate::failure::{Exit, Failure};
 use crate::page::{self, Page};
@@ -20,7 +21,7 @@ use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, RecordFolder, RecordHealth, Recorder};
 use crate::service_lasers::ServiceLasers;
-use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
+use crate::session::{self, Hangups, SessionPlan, SessionReport, ShownLevels, Summary, not_dark};
 use crate::{results, run_text, setup, source};
 
 /// Scenario of the built-in tracker.
@@ -36,6 +37,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     {
         return replay(args, output, &report);
     }
+    refuse_lasers(args)?;
     // From the first reading on, another may be asked for.
     let hangups = if args.rig.config.is_some() { Hangups::take_over()? } else { None };
     let rig = rig_of(args)?;
@@ -140,11 +142,13 @@ pub(super) fn judge(args: &RunArgs, rig: &Rig) -> Result<(), Failure> {
     {
         refuse_options(args, &report)?;
     }
+    refuse_lasers(args)?;
     page::judge(&args.page)?;
     source::judge(&args.scene, args.feed_dark_after, &rig.geometry)?;
     let rig = with_options(rig.clone(), args);
     let spec = rig.tracker.spec.as_deref().unwrap_or(SAMPLE_TRACKER);
     let spec: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
+    setup::refuse_port_of_others(&spec, &rig)?;
     if spec.files().iter().all(|file| file.exists()) {
         Tracker::examine(&spec, &rig.tracker).map_err(setup::tracker_failure)?;
     }
@@ -198,6 +202,19 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
     Ok(())
 }
 
+/// Refuses simulated lasers beside a panel that is one: nobody would see what the rig's own do.
+fn refuse_lasers(args: &RunArgs) -> Result<(), Failure> {
+    let output: OutputSpec = args.output.parse().map_err(Failure::because(Exit::Usage))?;
+    if args.lasers.is_none() || matches!(output, OutputSpec::Headless(_)) {
+        return Ok(());
+    }
+    let what = format!(
+        "--lasers simulated: found --output {}, expected headless: leave --lasers out where there is a panel",
+        args.output
+    );
+    Err(Failure::new(Exit::Usage, what))
+}
+
 /// Refuses what a report brings itself.
 fn refuse_options(args: &RunArgs, tracker: &TrackerSpec) -> Result<(), Failure> {
     if args.record.is_some() || args.record_in.is_some() {
@@ -217,6 +234,7 @@ fn refuse_options(args: &RunArgs, tracker: &TrackerSpec) -> Result<(), Failure> 
         ("--feed-dark-after", args.feed_dark_after.is_some()),
         ("--pupil", args.pupil.is_some()),
         ("--eye", args.eye.is_some()),
+        ("--lasers", args.lasers.is_some()),
         ("--scale", args.scale.is_some()),
     ];
     match given.into_iter().find(|(_, is_given)| *is_given) {
@@ -268,7 +286,19 @@ fn with_options(mut rig: Rig, args: &RunArgs) -> Rig {
     tracker.spec = args.tracker.clone().or(tracker.spec.take());
     tracker.eye = args.eye.unwrap_or(tracker.eye);
     tracker.scale = args.scale.or(tracker.scale);
+    match args.lasers {
+        None => {}
+        Some(LasersInstead::Simulated) => simulate_lasers(&mut rig.lasers),
+    }
     rig
+}
+
+/// Takes the simulated lasers in place of the rig's own, of the same colours.
+fn simulate_lasers(lasers: &mut Lasers) {
+    for colour in Colour::ALL.into_iter().filter(|&colour| !lasers.driver.has(colour)) {
+        lasers.power_mw[colour] = 0.0;
+    }
+    lasers.driver = LaserDriver::Simulated;
 }
 
 /// Writes the levels that the panel showed and `summary.json` into the record, which is lost where they cannot be
@@ -287,19 +317,84 @@ fn finish_record(session: &Arc<SessionReport>, folder: &Path, health: &Arc<Recor
     Ok(())
 }
 
+/// `summary.json` of a record.
+#[derive(Serialize)]
+struct RecordSummary<'a> {
+    #[serde(flatten)]
+    summary: &'a Summary,
+    shown_levels: Vec<KeptLevels>,
+}
+
+/// A picture of levels in a record, and what turns it into what an eye saw.
+#[derive(Serialize)]
+struct KeptLevels {
+    file: String,
+    frame: u64,
+    pupil_mm: f32,
+    /// The amplitude that double phase took as 1.
+    amplitude_constant: f32,
+    /// Size of the hologram in the middle of the panel.
+    hologram: [usize; 2],
+}
+
 /// Saves the levels first: the summary says whether they are there.
 fn save(session: &SessionReport, folder: &Path, health: &RecordHealth) {
     let cannot = |failure: Failure| health.give_up(&format!("cannot finish it: {failure}"));
-    save_shown(session, folder).unwrap_or_else(cannot);
+    let shown_levels = save_shown(session, folder).unwrap_or_else(|failure| {
+        cannot(failure);
+        Vec::new()
+    });
     let mut summary = session.summary.clone();
     summary.figures.record = Some(health.state());
+    let summary = RecordSummary { summary: &summary, shown_levels };
     results::save_json(&summary, &folder.join("summary.json")).unwrap_or_else(cannot);
 }
 
-fn save_shown(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
-    for (pupil, levels) in &session.shown {
-        let name = record::shown_name(pupil.mm(), levels.tag().frame_id);
-        results::save_png(levels_picture(levels), &folder.join(name))?;
+fn save_shown(session: &SessionReport, folder: &Path) -> Result<Vec<KeptLevels>, Failure> {
+    let Resolution { width, height } = session.encoder.pattern_resolution();
+    let save = |shown: &ShownLevels| {
+        let (frame, pupil_mm) = (shown.levels.tag().frame_id, shown.pupil.mm());
+        let file = record::shown_name(pupil_mm, frame);
+        results::save_png(levels_picture(&shown.levels), &folder.join(&file))?;
+        let amplitude_constant = shown.amplitude_constant;
+        Ok(KeptLevels { file, frame, pupil_mm, amplitude_constant, hologram: [width, height] })
+    };
+    session.shown.iter().map(save).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use holod_calibration::PerColour;
+    use holod_calibration::rig::TextLaserProfile;
+
+    use super::*;
+    use crate::cli::Cli;
+
+    #[test]
+    fn what_a_run_would_refuse_is_refused_before_there_is_one() {
+        let mut rig = Rig::default();
+        rig.lasers.driver = LaserDriver::Serial { path: "/dev/null".into(), sync_wire: false };
+        rig.tracker.spec = Some("serial:/dev/null".into());
+        let judged = |more: &[&str]| {
+            let cli = Cli::try_parse_from([&["holod"], more].concat()).unwrap();
+            judge(&cli.run, &rig).map_err(|failure| failure.to_string())
+        };
+        assert!(judged(&[]).unwrap_err().contains("/dev/null that the rig names for its lasers"));
+        assert_eq!(judged(&["--tracker", "mock:steady"]), Ok(()));
+        assert_eq!(judged(&["--lasers", "simulated"]), Ok(()));
+        let on_panel = judged(&["--lasers", "simulated", "--output", "drm:DP-1"]).unwrap_err();
+        assert!(on_panel.contains("found --output drm:DP-1, expected headless"), "{on_panel}");
     }
-    Ok(())
+
+    #[test]
+    fn simulated_lasers_have_the_colours_of_the_rigs_own() {
+        let mut lasers = Rig::default().lasers;
+        let profile = TextLaserProfile::named("cobolt").unwrap().clone();
+        lasers.driver =
+            LaserDriver::Text { profile: Box::new(profile), paths: PerColour([None, Some("/dev/null".into()), None]) };
+        let green_mw = lasers.power_mw[Colour::Green];
+        simulate_lasers(&mut lasers);
+        assert_eq!((lasers.driver, lasers.power_mw), (LaserDriver::Simulated, PerColour([0.0, green_mw, 0.0])));
+    }
 }

@@ -6,6 +6,6 @@ mod plots;
 mod sheet;
 
 pub use area::Area;
-pub use panel::{levels_picture, phase_picture, screen_picture, shown_pattern, video_pictures};
+pub use panel::{levels_picture, phase_picture, read_levels, screen_picture, shown_pattern, video_pictures};
 pub use plots::{LatencyPlot, PupilPlot, PupilSampleMark};
 pub use sheet::{Sheet, Tile};

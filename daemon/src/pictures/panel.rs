@@ -1,12 +1,18 @@
 //! From the panel's levels back to pictures and phases.
 
-use holod_calibration::rig::PanelMode;
-use holod_calibration::{Colour, Resolution};
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use holod_calibration::rig::{Panel, PanelMode};
+use holod_calibration::{Colour, PerColour, Resolution};
 use holod_model::LinearImage;
 use holod_model::optics::PhasePattern;
 use holod_slm_output::packing::{PIXEL_BYTES, PixelFormat, write_frame};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
-use image::{DynamicImage, ImageBuffer, Rgb, RgbImage};
+use image::{DynamicImage, ImageBuffer, ImageFormat, Pixel, Primitive, Rgb, RgbImage};
+
+use crate::failure::{Exit, Failure};
 
 /// The phases that the panel shows for `levels`, where it carries the pattern.
 pub fn shown_pattern(encoder: &PanelEncoder, levels: &LevelsFrame) -> PhasePattern {
@@ -18,10 +24,41 @@ pub fn shown_pattern(encoder: &PanelEncoder, levels: &LevelsFrame) -> PhasePatte
     pattern
 }
 
-/// The levels of the whole panel as a picture: each colour's low 8 bits in its own channel.
-pub fn levels_picture(levels: &LevelsFrame) -> RgbImage {
+/// The levels of the whole panel as a picture: each colour's in its own channel, as they are. A panel of more than 8
+/// bits has a picture of 16.
+pub fn levels_picture(levels: &LevelsFrame) -> DynamicImage {
     let fields = Colour::ALL.map(|colour| levels.unpack_colour(colour).levels);
-    from_planes(levels.layout().resolution, |colour, pixel| fields[colour][pixel] as u8)
+    let layout = levels.layout();
+    if layout.packing.bit_depth() > 8 {
+        from_planes(layout.resolution, |colour, pixel| fields[colour][pixel]).into()
+    } else {
+        from_planes(layout.resolution, |colour, pixel| fields[colour][pixel] as u8).into()
+    }
+}
+
+/// The levels that [`levels_picture`] wrote to the file at `path` for `panel` of `resolution`: red, green, blue.
+///
+/// # Errors
+/// The file cannot be read, or is no picture of such a panel.
+pub fn read_levels(path: &Path, panel: &Panel, resolution: Resolution) -> Result<PerColour<Vec<u16>>, Failure> {
+    let data = |what: String| Failure::new(Exit::Data, format!("{}: {what}", path.display()));
+    let file = File::open(path).map_err(|error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display())))?;
+    let picture = image::load(BufReader::new(file), ImageFormat::Png).map_err(|error| data(error.to_string()))?;
+    let bits = if panel.packing.bit_depth() > 8 { 16 } else { 8 };
+    let found = Resolution { width: picture.width() as usize, height: picture.height() as usize };
+    let found_bits = picture.color().bytes_per_pixel() * 8 / picture.color().channel_count();
+    if found != resolution || picture.color().channel_count() != 3 || u16::from(found_bits) != bits {
+        let channels = picture.color().channel_count();
+        return Err(data(format!(
+            "found a picture of {found} with {channels} channels of {found_bits} bits, expected one of {resolution} with 3 \
+             of {bits}, as a run of this rig records it; name the rig of that run (bench/rig.toml in the record)"
+        )));
+    }
+    let samples: Vec<u16> = match picture {
+        DynamicImage::ImageRgb8(picture) => picture.into_raw().into_iter().map(u16::from).collect(),
+        other => other.into_rgb16().into_raw(),
+    };
+    Ok(PerColour([0, 1, 2].map(|colour| samples.iter().copied().skip(colour).step_by(3).collect())))
 }
 
 /// What travels to the panel for `levels`, bit for bit and with what the video has around the panel: each different
@@ -75,10 +112,14 @@ pub fn screen_picture(picture: &LinearImage) -> RgbImage {
     RgbImage::from_raw(width as u32, height as u32, picture.to_srgb8()).expect("three bytes for each pixel")
 }
 
-fn from_planes(resolution: Resolution, value: impl Fn(usize, usize) -> u8) -> RgbImage {
-    RgbImage::from_fn(resolution.width as u32, resolution.height as u32, |x, y| {
+fn from_planes<T>(resolution: Resolution, value: impl Fn(usize, usize) -> T) -> ImageBuffer<Rgb<T>, Vec<T>>
+where
+    Rgb<T>: Pixel<Subpixel = T>,
+    T: Primitive,
+{
+    ImageBuffer::from_fn(resolution.width as u32, resolution.height as u32, |x, y| {
         let pixel = y as usize * resolution.width + x as usize;
-        image::Rgb([0, 1, 2].map(|colour| value(colour, pixel)))
+        Rgb([0, 1, 2].map(|colour| value(colour, pixel)))
     })
 }
 
@@ -88,6 +129,33 @@ mod tests {
     use holod_slm_output::FrameLayout;
 
     use super::*;
+
+    #[test]
+    fn a_picture_of_levels_has_all_of_their_bits_and_is_read_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("levels.png");
+        let resolution = Resolution { width: 4, height: 2 };
+        let mut panel = Rig::default().panel;
+        for (packing, top) in [(Packing::Gray, 255), (Packing::Gray10, 1023), (Packing::Red8Green8, 65535)] {
+            (panel.packing, panel.bit_depth) = (packing, packing.bit_depth());
+            let mut levels = LevelsFrame::new(FrameLayout::new(&panel, resolution));
+            for (index, sample) in levels.samples_mut().iter_mut().enumerate() {
+                *sample = top - index as u16;
+            }
+            crate::results::save_png(levels_picture(&levels), &path).unwrap();
+            let read = read_levels(&path, &panel, resolution).unwrap();
+            for colour in Colour::ALL {
+                assert_eq!(read[colour], levels.unpack_colour(colour).levels, "{packing:?} {colour}");
+            }
+        }
+        for (packing, resolution) in
+            [(Packing::Gray, resolution), (Packing::Gray10, Resolution { height: 4, ..resolution })]
+        {
+            panel.packing = packing;
+            let refused = read_levels(&path, &panel, resolution).unwrap_err();
+            assert!(refused.to_string().contains("4x2 with 3 channels of 16 bits"), "{refused}");
+        }
+    }
 
     #[test]
     fn a_video_picture_has_what_the_video_has_around_the_panel() {

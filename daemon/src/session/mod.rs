@@ -34,7 +34,7 @@ pub use self::plan::SessionPlan;
 pub use self::service::Hangups;
 pub(crate) use self::service::Signals;
 pub(crate) use self::sleep::SleepWatch;
-pub use self::summary::{SessionReport, Summary};
+pub use self::summary::{SessionReport, ShownLevels, Summary};
 pub use self::take_down::{NO_ACKNOWLEDGEMENT, PANEL_HANGS, not_dark};
 
 /// Runs until a limit, a signal or a failure ends it; lasers are dark when it returns.

@@ -16,10 +16,20 @@ pub struct SessionReport {
     pub summary: Summary,
     /// When the run began.
     pub t_origin: TimeNs,
-    /// Levels that the panel showed, with the pupil that each frame was made for, narrowest first.
-    pub shown: Vec<(PupilDiameter, LevelsFrame)>,
+    /// Levels that the panel showed, narrowest pupil first.
+    pub shown: Vec<ShownLevels>,
     /// Turns levels back into phase.
     pub encoder: Arc<PanelEncoder>,
+}
+
+/// Levels that the panel showed, and what their frame was made for.
+pub struct ShownLevels {
+    /// The pupil.
+    pub pupil: PupilDiameter,
+    /// The amplitude that double phase took as 1.
+    pub amplitude_constant: f32,
+    /// The levels.
+    pub levels: LevelsFrame,
 }
 
 /// The numbers of a run; `summary.json`.

@@ -3,13 +3,10 @@
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use holod_calibration::PupilDiameter;
-use holod_slm_output::LevelsFrame;
-
 use super::build::Session;
 use super::clock::host_now;
 use super::ledger::LaserSummary;
-use super::summary::{SessionReport, Summary};
+use super::summary::{SessionReport, ShownLevels, Summary};
 use crate::aside::ends_within;
 use crate::failure::{Exit, Failure};
 use crate::snapshot::Figures;
@@ -75,13 +72,9 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
     if tally.frames_shown == 0 {
         tracing::warn!("no frame was shown: the run ended before the first one was ready; give it longer");
     }
-    let mut shown: Vec<(PupilDiameter, LevelsFrame)> = down
-        .kept
-        .into_iter()
-        .flatten()
-        .filter_map(|levels| Some((tally.pupil_of_kept(levels.tag().frame_id)?, levels)))
-        .collect();
-    shown.sort_by(|(a, _), (b, _)| a.mm().total_cmp(&b.mm()));
+    let kept = down.kept.into_iter().flatten();
+    let mut shown: Vec<ShownLevels> = kept.filter_map(|levels| tally.shown_levels(levels)).collect();
+    shown.sort_by(|a, b| a.pupil.mm().total_cmp(&b.pupil.mm()));
     let duration_s = (host_now() - limits.t_origin).seconds();
     let counters = watch.tracker.counters();
     let summary = Summary {

@@ -3,13 +3,15 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use holod_calibration::{PupilDiameter, TimeNs};
-use holod_slm_output::FieldEvent;
+use holod_slm_output::{FieldEvent, LevelsFrame};
 
 use super::frame_loop::{LoopRecord, RECORDS};
 use super::ledger::LaserLedger;
 use super::observer::FirstLight;
 use super::recorded_levels::KEEP_SLOTS;
 use super::stats::Recent;
+use super::summary::ShownLevels;
+use crate::record::FrameRecord;
 
 /// Frames whose fields may still come: all that the ring of records can hold at once, and some more.
 const REMEMBERED: usize = RECORDS + 64;
@@ -18,7 +20,7 @@ const REMEMBERED: usize = RECORDS + 64;
 #[derive(Default)]
 pub(super) struct Tally {
     recent: VecDeque<LoopRecord>,
-    kept: [Option<(u64, PupilDiameter)>; KEEP_SLOTS],
+    kept: [Option<FrameRecord>; KEEP_SLOTS],
     pub(super) lasers: LaserLedger,
     pub(super) frames_made: u64,
     pub(super) frames_shown: u64,
@@ -83,7 +85,7 @@ impl Tally {
             self.t_picture_in_hand = record.t_picture_in_hand;
             self.t_shown_begun = Some(frame.t_wake);
             if let Some(slot) = frame.keep {
-                self.kept[slot] = Some((frame.frame, frame.pupil));
+                self.kept[slot] = Some(*frame);
             }
         }
         // Its first fields may have stayed dark.
@@ -128,16 +130,16 @@ impl Tally {
         self.newest_shown == self.newest_made
     }
 
-    /// The pupil that a frame was made for whose levels were kept.
-    pub(super) fn pupil_of_kept(&self, frame: u64) -> Option<PupilDiameter> {
-        self.kept.iter().flatten().find(|(kept, _)| *kept == frame).map(|(_, pupil)| *pupil)
+    /// Levels that were kept, with what their frame was made for.
+    pub(super) fn shown_levels(&self, levels: LevelsFrame) -> Option<ShownLevels> {
+        let frame = self.kept.iter().flatten().find(|kept| kept.frame == levels.tag().frame_id)?;
+        Some(ShownLevels { pupil: frame.pupil, amplitude_constant: frame.amplitude_constant, levels })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::record::FrameRecord;
     use crate::source::{LIVE_WITHIN, PictureTag};
     use holod_calibration::Colour;
     use holod_slm_output::TimestampSource;

@@ -60,6 +60,7 @@ class Rig:
     def phase_of(
         self, levels: _Levels, *, width_px: int | None = None, height_px: int | None = None
     ) -> NDArray[np.float32]: ...
+    def read_levels(self, path: _Path) -> _Levels: ...
 
 @final
 class Renderer:

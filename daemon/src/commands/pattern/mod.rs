@@ -43,7 +43,8 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
     if to.rig.config.is_none() && !matches!(output, OutputSpec::Headless(_)) {
         tracing::warn!("no --config: this is the built-in rig's panel and optics, and it lights no lasers");
     }
-    let shown = show::show(&output, &rig, &encoder, &levels, to)?;
+    let lit = show::rig_with_lasers_of(rig, &placement);
+    let shown = show::show(&output, &lit, &encoder, &levels, to)?;
     results::print(&shown.to_string())?;
     match shown.lasers_dark {
         true => Ok(()),

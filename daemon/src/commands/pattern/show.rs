@@ -8,6 +8,7 @@ use holod_calibration::{Colour, PerColour, TimeNs};
 use holod_pupil_input::host_now;
 use holod_slm_output::laser::{DarkReason, open_laser};
 use holod_slm_output::output::{OutputError, pacing_config};
+use holod_slm_output::patterns::Placement;
 use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, PanelEncoder, PanelEvent};
 
@@ -31,10 +32,20 @@ pub(super) struct Shown {
     lit: PerColour<u64>,
     /// Fields of lasers that are simply on while their box is armed.
     not_told: PerColour<u64>,
+    has_power: PerColour<bool>,
     /// Why the last field that was not lit was not.
     dark: Option<DarkReason>,
     pub(super) lasers_dark: bool,
     flat_presented: bool,
+}
+
+/// The rig without the light of the colours that `placement` leaves flat: theirs would all be in the middle, on top of
+/// what is to be looked at.
+pub(super) fn rig_with_lasers_of(mut rig: Rig, placement: &Placement) -> Rig {
+    for colour in Colour::ALL.into_iter().filter(|&colour| !placement.colours[colour]) {
+        rig.lasers.power_mw[colour] = 0.0;
+    }
+    rig
 }
 
 /// Shows `levels` on the panel that `spec` names until the asked time is over or a signal comes; lasers are dark when
@@ -66,7 +77,8 @@ pub(super) fn show(
     let t_begin = host_now();
     let duration = to.duration.map(|duration| TimeNs(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)));
     let mut pacer = Pacer::new(pacing, t_begin);
-    let mut shown = Shown::default();
+    let has_power = rig.lasers.power_mw.map(|power_mw| power_mw > 0.0);
+    let mut shown = Shown { has_power, ..Shown::default() };
     let ended = 'frames: loop {
         let plan = pacer.predict(host_now());
         loop {
@@ -155,6 +167,7 @@ impl fmt::Display for Shown {
         )?;
         for (colour, fields) in self.fields.iter().filter(|(_, fields)| **fields > 0) {
             match self.not_told[colour] {
+                _ if !self.has_power[colour] => writeln!(f, "{colour}: {fields} fields, its laser without power")?,
                 0 => writeln!(f, "{colour}: {fields} fields, {} of them lit", self.lit[colour])?,
                 on => writeln!(f, "{colour}: {fields} fields, its laser on in {on} of them as far as it was told")?,
             }
@@ -163,5 +176,20 @@ impl fmt::Display for Shown {
             writeln!(f, "not lit, last: {reason}")?;
         }
         write!(f, "lasers dark at the end: {}; flat pattern on the panel: {}", self.lasers_dark, self.flat_presented)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lasers_of_colours_that_are_not_named_have_no_power() {
+        let rig = Rig::default();
+        let lit = |colours: &[Colour]| {
+            rig_with_lasers_of(rig.clone(), &Placement::new([0.0; 2], colours)).lasers.power_mw.map(|mw| mw > 0.0)
+        };
+        assert_eq!(lit(&[Colour::Green]), PerColour([false, true, false]));
+        assert_eq!(lit(&[]), PerColour([true; 3]));
     }
 }

@@ -113,6 +113,11 @@ impl Sight {
             }
             Pattern::FieldIdentity { .. } => notes.extend(identity_notes(pattern, rig, encoder, &fields)?),
         }
+        let unnamed = Colour::ALL.into_iter().filter(|&colour| !placement.colours[colour]).map(Colour::name);
+        let unnamed: Vec<_> = unnamed.collect();
+        if !unnamed.is_empty() {
+            notes.push(format!("--output shows it with no light of {}", unnamed.join(" and ")));
+        }
         if !spots.is_empty() {
             if !matches!(pattern, Pattern::Level { .. }) {
                 notes.push(
