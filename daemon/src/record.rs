@@ -4,16 +4,18 @@
 mod folder;
 mod frame_log;
 mod health;
+mod place;
 mod recorder;
 mod sources;
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use holod_calibration::{Colour, PupilDiameter, TimeNs};
 use holod_slm_output::{FieldEvent, LevelsFrame};
 use twox_hash::XxHash3_64;
 
+use crate::failure::{Exit, Failure};
 use crate::source::PictureTag;
 
 pub(crate) use self::folder::{EARLIER, RecordFolder};
@@ -162,9 +164,42 @@ pub(crate) fn shown_levels(folder: &Path) -> std::io::Result<Vec<String>> {
     Ok(names)
 }
 
+/// Refuses a record that lacks what a run writes once and reads never again.
+///
+/// # Errors
+/// Something is missing in `folder`.
+pub(crate) fn judge_parts(folder: &Path) -> Result<(), Failure> {
+    let is_missing = |path: &PathBuf| !path.try_exists().unwrap_or(true);
+    let parts = [RUN.into(), LOG.into(), Path::new(BENCH).join(RIG)].map(|part: PathBuf| folder.join(part));
+    let missing: Vec<_> = parts.iter().filter(|path| is_missing(path)).map(|path| path.display().to_string()).collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let what = format!("it lacks {}; leave a record as it is until its run is over", missing.join(", "));
+    Err(Failure::new(Exit::CannotCreate, what))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn parts_that_are_missing_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |part: &str| folder.path().join(part);
+        fs::create_dir(at(BENCH)).unwrap();
+        let parts = ["run.json", "log.txt", "bench/rig.toml"];
+        for part in parts {
+            fs::write(at(part), "").unwrap();
+        }
+        judge_parts(folder.path()).unwrap();
+        for part in parts {
+            fs::remove_file(at(part)).unwrap();
+            let failure = judge_parts(folder.path()).unwrap_err().to_string();
+            assert!(failure.contains(&format!("lacks {}; leave", at(part).display())), "{failure}");
+            fs::write(at(part), "").unwrap();
+        }
+    }
 
     #[test]
     fn levels_are_known_by_the_whole_of_their_name() {

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use holod_tests::daemon::{Daemon, Ended, wait_until};
 use holod_tests::{frames, small_rig};
+use rustix::process::Signal;
 use serde_json::{Value, json};
 
 use crate::HOLOD;
@@ -266,7 +267,7 @@ fn the_rig_file_is_read_again_and_taken_whole_or_not_at_all() {
     assert_eq!((&status["eye"], &status["weights"]), (&json!("right"), &json!("standard")));
 
     write(&good, &[]);
-    bench.daemon.as_ref().unwrap().signal(rustix::process::Signal::HUP);
+    bench.daemon.as_ref().unwrap().signal(Signal::HUP);
     bench.until("SIGHUP is obeyed", |status| status["eye"] == "both" && status["weights"] == "fast");
 
     let (summary, folder) = bench.stop();
@@ -291,7 +292,7 @@ fn a_terminal_that_goes_away_ends_the_run_in_order() {
     let frames = folder.path().join("record/frames.csv");
     let lit = || frames::read(&frames).is_ok_and(|rows| rows.iter().any(|row| row.laser_on_ns.is_some()));
     assert!(wait_until(PATIENCE, lit), "no light");
-    terminal.signal(rustix::process::Signal::KILL);
+    terminal.signal(Signal::KILL);
     let summary = folder.path().join("record/summary.json");
     assert!(wait_until(PATIENCE, || summary.exists()), "the run goes on without its terminal");
     let summary: Value = serde_json::from_str(&fs::read_to_string(summary).unwrap()).unwrap();
@@ -309,12 +310,12 @@ fn a_run_that_is_to_outlive_its_terminal_does() {
         let args = [&[program, HOLOD][..], &options].concat();
         let mut daemon = Daemon::start_with("env", &args, folder.path(), &environment);
         assert!(wait_until(PATIENCE, || frames() > 100), "no frames");
-        daemon.signal(rustix::process::Signal::HUP);
+        daemon.signal(Signal::HUP);
         if outlives {
             let before = frames();
             assert!(wait_until(PATIENCE, || frames() > before + 100), "no frames after the signal");
             assert!(daemon.runs());
-            daemon.signal(rustix::process::Signal::TERM);
+            daemon.signal(Signal::TERM);
         }
         let ended = daemon.wait(PATIENCE);
         assert!(ended.status.success(), "{}", ended.stderr);
@@ -438,4 +439,42 @@ fn strangers_on_the_socket_are_answered_and_the_loop_goes_on() {
     bench.until("the last one holds", |status| status["pupil_mm"] == 4.0);
     bench.stop();
     assert!(!socket.exists());
+}
+
+#[test]
+fn lasers_whose_darkness_was_asked_for_last_stay_dark_though_holod_stood_still_meanwhile() {
+    let bench = Bench::start(&["--weights", "fast"]);
+    let socket = bench.socket();
+    let daemon = bench.daemon.as_ref().unwrap();
+    let ask = |order: &str| {
+        let mut stream = UnixStream::connect(&socket).unwrap();
+        stream.write_all(format!("{}\n", json!({ "do": order })).as_bytes()).unwrap();
+        stream
+    };
+    let answer = |stream: UnixStream| {
+        let mut answer = String::new();
+        BufReader::new(stream).read_line(&mut answer).unwrap();
+        serde_json::from_str::<Value>(&answer).unwrap()
+    };
+    for gives_up in [true, false, true, false, true, false] {
+        daemon.signal(Signal::STOP);
+        std::thread::sleep(Duration::from_millis(200));
+        let arm = ask("lasers-arm");
+        let arm = if gives_up { None } else { Some(arm) };
+        let dark = ask("lasers-dark");
+        daemon.signal(Signal::CONT);
+        let dark = answer(dark);
+        assert!(dark["ok"].as_str().unwrap_or_default().contains("the lasers are dark"), "{dark}");
+        arm.map(answer);
+        // Whatever was to follow has followed.
+        bench.frames_go_on(20);
+        let status = bench.status();
+        assert_eq!((&status["lasers"], &status["lasers_kept_dark"]), (&json!("dark"), &json!(true)), "{status}");
+        bench.ctl(&["lasers", "arm"]);
+        bench.until("the lasers are lit again", |status| status["lasers"] == "armed");
+    }
+    let (_, folder) = bench.stop();
+    let orders = fs::read_to_string(folder.path().join("record/orders.jsonl")).unwrap();
+    let orders: Vec<Value> = orders.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert!(orders.iter().filter(|order| order["request"]["do"] == "lasers-dark").count() == 6, "{orders:?}");
 }

@@ -139,6 +139,32 @@ fn a_record_that_is_deleted_is_given_up_and_frames_go_on() {
 }
 
 #[test]
+fn files_of_a_record_that_go_missing_are_told_and_no_order_takes_anothers_line() {
+    let folder = bench();
+    let at = |name: &str| folder.path().join("record").join(name);
+    let daemon = start(folder.path(), &["--record", "record"]);
+    fs::remove_file(at("log.txt")).unwrap();
+    fs::remove_dir_all(at("bench")).unwrap();
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    judge_lost(&ended, "it lacks record/log.txt, record/bench/rig.toml; leave a record as it is");
+    let summary: Value = serde_json::from_slice(&fs::read(at("summary.json")).unwrap()).unwrap();
+    assert_eq!(summary["record"]["state"], "lost", "{summary:#}");
+
+    let daemon = start(folder.path(), &["--record", "record", "--force"]);
+    let pupil = |mm: &str| assert!(ask(folder.path(), &["ctl", "pupil", mm]).status.success());
+    pupil("3");
+    assert!(wait_until(PATIENCE, || at("orders.jsonl").exists()));
+    fs::remove_file(at("orders.jsonl")).unwrap();
+    pupil("4");
+    let reason = until_record_is_lost(folder.path());
+    assert!(reason.contains("record/orders.jsonl: the file was deleted or moved"), "{reason}");
+    assert!(!at("orders.jsonl").exists());
+    daemon.signal(Signal::TERM);
+    judge_lost(&daemon.wait(PATIENCE), "orders.jsonl");
+}
+
+#[test]
 fn a_record_that_grows_beyond_the_users_limit_is_given_up_and_can_be_read() {
     let folder = bench();
     // In blocks of 512 or 1024 bytes, by the shell: some seconds of rows.

@@ -168,3 +168,45 @@ fn a_bench_is_rehearsed_with_simulated_lasers_in_place_of_its_own() {
     assert_eq!(ended.status.code(), Some(64), "{}", ended.stderr);
     assert!(ended.stderr.contains("found --output drm:DP-99, expected headless"), "{}", ended.stderr);
 }
+
+#[test]
+fn a_run_whose_folder_was_moved_goes_on_in_it_and_leaves_the_next_runs_alone() {
+    let bench = bench();
+    let at = |name: &str| bench.path().join(name);
+    let rows = |record: &str| fs::read_to_string(at(record).join("frames.csv")).map_or(0, |text| text.lines().count());
+    let order = |daemon: &Daemon, mm: &str| {
+        let ended = run(HOLOD, &["ctl", "pupil", mm, "--pid", &daemon.pid().to_string()], bench.path());
+        assert!(ended.status.success(), "{}", ended.stderr);
+    };
+    let first = Daemon::start(HOLOD, &args(), bench.path());
+    assert!(wait_until(PATIENCE, || rows("record") > 10));
+    fs::rename(at("record"), at("moved")).unwrap();
+    let second = Daemon::start(HOLOD, &args(), bench.path());
+    assert!(wait_until(PATIENCE, || rows("record") > 10));
+    order(&first, "3");
+    order(&second, "4");
+    second.signal(Signal::TERM);
+    let ended = second.wait(PATIENCE);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let of_second = contents(&at("record"));
+    let before = rows("moved");
+    assert!(wait_until(PATIENCE, || rows("moved") > before + 10));
+    first.signal(Signal::TERM);
+    let ended = first.wait(PATIENCE);
+    assert_eq!(ended.status.code(), Some(73), "{}", ended.stderr);
+    let last = ended.stderr.lines().last().unwrap();
+    assert!(last.contains("record's folder record was moved to /") && last.contains("/moved while"), "{last}");
+    assert!(contents(&at("record")) == of_second, "the next run's record is as it was");
+
+    let orders = fs::read_to_string(at("moved/orders.jsonl")).unwrap();
+    assert!(orders.lines().count() == 1 && orders.contains("3.0"), "{orders}");
+    let names = |record: &str| {
+        let files = contents(&at(record)).into_keys().map(|path| path.strip_prefix(at(record)).unwrap().to_owned());
+        files.filter(|path| !path.to_string_lossy().contains("shown_pupil_")).collect::<Vec<_>>()
+    };
+    assert_eq!(names("moved"), names("record"));
+    let shown = |path: &PathBuf| path.to_string_lossy().contains("shown_pupil_");
+    assert!(contents(&at("moved")).keys().any(shown));
+    let packed = run(HOLOD, &["report", "moved", "--out", "report.tar.gz"], bench.path());
+    assert!(packed.status.success(), "{}", packed.stderr);
+}

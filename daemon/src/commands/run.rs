@@ -86,7 +86,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         output,
         tracker,
         pupil: args.pupil,
-        record_tracker: observers.0.as_ref().map(|recorder| RecordFiles::in_folder(recorder.folder())),
+        record_tracker: observers.0.as_ref().map(|recorder| RecordFiles::in_folder(&recorder.folder())),
         record: observers.0.as_ref().map(Recorder::health),
         frame_limit: args.frames,
         duration: args.duration,
@@ -96,10 +96,10 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let session = match session::run(plan, &mut observers) {
         Ok(session) => session,
         Err(failure) => {
-            if let (Some(recorder), _) = observers {
-                recorder.fail(&failure);
-            }
-            return Err(failure);
+            return Err(match observers.0 {
+                Some(recorder) => recorder.fail(&failure),
+                None => failure,
+            });
         }
     };
     let (Some(mut recorder), _) = observers else { return tell(args, &session.summary, None) };
@@ -107,7 +107,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let health = recorder.health();
     let session = Arc::new(session);
     if has_record && !health.is_lost() {
-        finish_record(&session, recorder.folder(), &health)?;
+        finish_record(&session, &recorder.folder(), &health)?;
     }
     let mut summary = session.summary.clone();
     summary.figures.record = (has_record || health.is_lost()).then(|| health.state());
@@ -340,6 +340,7 @@ struct KeptLevels {
 /// Saves the levels first: the summary says whether they are there.
 fn save(session: &SessionReport, folder: &Path, health: &RecordHealth) {
     let cannot = |failure: Failure| health.give_up(&format!("cannot finish it: {failure}"));
+    record::judge_parts(folder).unwrap_or_else(cannot);
     let shown_levels = save_shown(session, folder).unwrap_or_else(|failure| {
         cannot(failure);
         Vec::new()

@@ -1,39 +1,10 @@
 //! The control socket's requests, for the fuzzers.
 
-use std::sync::{Arc, LazyLock, Mutex};
-
-use holod_calibration::rig::Rig;
-use holod_calibration::{Resolution, TimeNs};
-use holod_model::RgbdFrame;
-use holod_slm_output::output::DarkSwitch;
+use std::sync::LazyLock;
 
 use super::{NewPattern, Order, Preparer, Request};
-use crate::cli::Backend;
-use crate::dark_note::DarkNote;
-use crate::renderer::{self, Use};
 
-const RESOLUTION: Resolution = Resolution { width: 64, height: 48 };
-
-static PREPARER: LazyLock<Preparer> = LazyLock::new(|| {
-    let mut rig = Rig::default();
-    rig.geometry.resolution = RESOLUTION;
-    let encoder = renderer::panel_encoder(&rig, RESOLUTION).expect("the built-in panel has levels");
-    Preparer {
-        dark_note: DarkNote::on(&rig.lasers.driver),
-        weights: Arc::new(Mutex::new(rig.model.weights.clone())),
-        rig,
-        rig_again: None,
-        resolution: RESOLUTION,
-        frame: Arc::new(RgbdFrame::black(RESOLUTION)),
-        backend: Backend::Cpu,
-        used_for: Use::Command,
-        encoder,
-        has_feed: true,
-        plays: false,
-        stall_timeout: TimeNs(2_000_000_000),
-        lasers: DarkSwitch::of_no_output(),
-    }
-});
+static PREPARER: LazyLock<Preparer> = LazyLock::new(Preparer::of_a_small_rig);
 
 /// A line of JSON. It is understood and obeyed as far as no file is named, or refused in words.
 ///

@@ -63,6 +63,32 @@ pub(crate) struct NewEngine {
     pub(crate) weights: WeightsChoice,
 }
 
+#[cfg(any(test, fuzzing))]
+impl Preparer {
+    /// One for a small panel, whose lasers and notes are nowhere.
+    pub(super) fn of_a_small_rig() -> Self {
+        let resolution = Resolution { width: 64, height: 48 };
+        let mut rig = Rig::default();
+        rig.geometry.resolution = resolution;
+        let encoder = renderer::panel_encoder(&rig, resolution).expect("the built-in panel has levels");
+        Self {
+            dark_note: DarkNote::on(&rig.lasers.driver),
+            weights: Arc::new(Mutex::new(rig.model.weights.clone())),
+            rig,
+            rig_again: None,
+            resolution,
+            frame: Arc::new(RgbdFrame::black(resolution)),
+            backend: Backend::Cpu,
+            used_for: Use::Command,
+            encoder,
+            has_feed: true,
+            plays: false,
+            stall_timeout: TimeNs(2_000_000_000),
+            lasers: DarkSwitch::of_no_output(),
+        }
+    }
+}
+
 impl Preparer {
     /// Makes a request ready.
     ///

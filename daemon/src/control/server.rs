@@ -1,5 +1,6 @@
 //! The control socket, in tokio, with one thread of its own and one for what takes long; no real-time thread waits for
-//! either.
+//! either. On its own thread tasks take their turns in order: of two connections at rest the one that asks first is
+//! obeyed first.
 
 use std::cell::Cell;
 use std::collections::BTreeMap;
@@ -8,14 +9,16 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU8, AtomicUsize, Ordering};
 use std::sync::{Arc, mpsc};
+use std::thread;
 use std::time::{Duration, Instant};
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::net::SocketType;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{UnixListener, UnixStream};
-use tokio::runtime::Runtime;
+use tokio::runtime::Handle;
 use tokio::sync::{Semaphore, SemaphorePermit, oneshot};
-use tokio::task::AbortHandle;
+use tokio::task::{AbortHandle, yield_now};
 
 use super::{Answer, Order, Ordered, Preparer, Request};
 use crate::local_socket::{self, LOOK, SocketPlace};
@@ -31,12 +34,16 @@ const STACK_BYTES: usize = 8 << 20;
 const PATIENCE: Duration = Duration::from_secs(5);
 /// How long the end of a run waits for answers to be sent.
 const FAREWELL: Duration = Duration::from_millis(500);
+/// Turns within which whatever had come before them is read: one for the socket, one for a connection, and some more.
+const TURNS: u32 = 4;
 
 /// A control socket that listens. Dropping it ends that.
 pub(crate) struct ControlServer {
     place: Arc<SocketPlace>,
     waiting: Arc<Waiting>,
-    runtime: Option<Runtime>,
+    runtime: Handle,
+    /// The thread ends when this is dropped.
+    _end: oneshot::Sender<()>,
 }
 
 impl ControlServer {
@@ -50,8 +57,7 @@ impl ControlServer {
     ) -> Result<(Self, mpsc::Receiver<Ordered>), Box<dyn std::error::Error>> {
         let (listener, place) = local_socket::listen(&socket, SocketType::STREAM)?;
         let place = Arc::new(place);
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(1)
+        let runtime = tokio::runtime::Builder::new_current_thread()
             .max_blocking_threads(1)
             .thread_name("holod-control")
             .thread_stack_size(STACK_BYTES)
@@ -63,28 +69,27 @@ impl ControlServer {
             let _inside = runtime.enter();
             UnixListener::from_std(listener.into())?
         };
-        let waiting = Waiting {
-            preparer,
-            orders,
-            long_work: Semaphore::new(1),
-            signal_waits: AtomicBool::new(false),
-            under_way: AtomicUsize::new(0),
-            refused: TallyBy::default(),
-        };
-        let waiting = Arc::new(waiting);
-        runtime.spawn(serve(listener, Arc::clone(&place), Arc::clone(&waiting)));
-        Ok((Self { place, waiting, runtime: Some(runtime) }, receiver))
+        let waiting = Arc::new(Waiting::new(preparer, orders));
+        let handle = runtime.handle().clone();
+        handle.spawn(serve(listener, Arc::clone(&place), Arc::clone(&waiting)));
+        let (end, ended) = oneshot::channel();
+        thread::Builder::new().name("holod-control".into()).stack_size(STACK_BYTES).spawn(move || {
+            let _dropped = runtime.block_on(ended);
+            // What is still being made ready ends with the process.
+            runtime.shutdown_background();
+        })?;
+        Ok((Self { place, waiting, runtime: handle, _end: end }, receiver))
     }
 
     /// Has the rig file read again for a signal, which cannot ask twice: after whatever takes long now. What came of it
     /// is said in the log.
     pub(crate) fn reload_by_signal(&self) {
-        let (Some(runtime), waiting) = (&self.runtime, Arc::clone(&self.waiting)) else { return };
+        let waiting = Arc::clone(&self.waiting);
         // One that waits will read the file as it is then.
         if waiting.signal_waits.swap(true, Ordering::AcqRel) {
             return;
         }
-        runtime.spawn(async move {
+        self.runtime.spawn(async move {
             let Ok(alone) = waiting.long_work.acquire().await else { return };
             waiting.signal_waits.store(false, Ordering::Release);
             match take_time(Request::Reload { changed: BTreeMap::new() }, &waiting, alone).await {
@@ -110,11 +115,7 @@ impl Drop for ControlServer {
         // Whoever asked for the end is told that it came.
         let t_end = Instant::now() + FAREWELL;
         while self.waiting.under_way.load(Ordering::Acquire) > 0 && Instant::now() < t_end {
-            std::thread::sleep(Duration::from_millis(1));
-        }
-        if let Some(runtime) = self.runtime.take() {
-            // What is still being made ready ends with the process.
-            runtime.shutdown_background();
+            thread::sleep(Duration::from_millis(1));
         }
         self.place.take_away();
     }
@@ -195,6 +196,16 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>, claim: &Claim) -> io:
         let _until_it_is_answered = UnderWay::count(&desk.under_way);
         let is_whole = line.ends_with(b"\n");
         let request = Request::from_line(&line);
+        if let Ok(request) = &request
+            && request.changes_something()
+            && !matches!(request, Request::LasersDark {} | Request::Stop {})
+            && has_gone(read.get_ref().as_ref())
+        {
+            // Who gave up waiting, or somebody else, may have wanted something else since.
+            desk.refused.count(Refused::Unanswered);
+            tracing::info!("left undone, as whoever asked has gone: {}", String::from_utf8_lossy(line.trim_ascii()));
+            return Ok(());
+        }
         claim.set(if request == Ok(Request::LasersDark {}) { Claim::DARKNESS } else { Claim::AN_ORDER });
         let answer = if is_whole {
             answer(request, desk).await
@@ -212,6 +223,12 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>, claim: &Claim) -> io:
     }
 }
 
+/// Whether nobody is at the other end any more. One that sends nothing more may still wait for its answer.
+fn has_gone(stream: &UnixStream) -> bool {
+    let mut stream = [PollFd::new(stream, PollFlags::empty())];
+    poll(&mut stream, Some(&Timespec::default())).is_ok() && stream[0].revents().contains(PollFlags::HUP)
+}
+
 async fn answer(request: Result<Request, String>, desk: &Arc<Waiting>) -> Answer {
     match request {
         Ok(request) => answer_to(request, desk).await,
@@ -222,8 +239,18 @@ async fn answer(request: Result<Request, String>, desk: &Arc<Waiting>) -> Answer
 async fn answer_to(request: Request, desk: &Arc<Waiting>) -> Answer {
     // Nothing that takes long stands before darkness.
     if !request.takes_long() {
+        let wants_darkness = request == Request::LasersDark {};
+        if request == (Request::LasersArm {}) && desk.dark_wishes.load(Ordering::Acquire) > 0 {
+            // Which of them came first is not known.
+            return desk.refuse(Refused::Declined, "`lasers dark` has been asked for at the same time: ask again");
+        }
+        let _wish = wants_darkness.then(|| UnderWay::count(&desk.dark_wishes));
         let prepared = desk.preparer.prepare(&request);
-        return hand_over(prepared, request, desk).await;
+        let answer = hand_over(prepared, request, desk).await;
+        for _ in 0..if wants_darkness { TURNS } else { 0 } {
+            yield_now().await;
+        }
+        return answer;
     }
     match desk.long_work.try_acquire() {
         Ok(alone) => take_time(request, desk, alone).await,
@@ -315,6 +342,8 @@ struct Waiting {
     signal_waits: AtomicBool,
     /// Requests that have no answer yet.
     under_way: AtomicUsize,
+    /// Of these, wishes for darkness.
+    dark_wishes: AtomicUsize,
     refused: TallyBy<Refused>,
 }
 
@@ -331,7 +360,7 @@ enum Refused {
     Declined,
     /// holod failed over it.
     Failed,
-    /// The run did not say anything, or was ending.
+    /// The run did not say anything or was ending, or whoever asked had gone.
     Unanswered,
 }
 
@@ -361,6 +390,18 @@ pub(crate) fn panic_is_caught() -> bool {
 }
 
 impl Waiting {
+    fn new(preparer: Preparer, orders: mpsc::Sender<Ordered>) -> Self {
+        Self {
+            preparer,
+            orders,
+            long_work: Semaphore::new(1),
+            signal_waits: AtomicBool::new(false),
+            under_way: AtomicUsize::new(0),
+            dark_wishes: AtomicUsize::new(0),
+            refused: TallyBy::default(),
+        }
+    }
+
     /// The answer to a request that is not carried out, which is counted.
     fn refuse(&self, reason: Refused, why: impl Into<String>) -> Answer {
         self.refused.count(reason);
@@ -377,7 +418,109 @@ impl Waiting {
 
 #[cfg(test)]
 mod tests {
+    use std::io::{BufRead, Write};
+    use std::net::Shutdown;
+    use std::os::unix::net::UnixStream as Stream;
+
     use super::*;
+
+    /// Waits for whatever a test waits for.
+    const LONG: Duration = Duration::from_secs(20);
+
+    /// A control socket; the test obeys.
+    fn listen() -> (tempfile::TempDir, ControlServer, mpsc::Receiver<Ordered>) {
+        let folder = tempfile::tempdir().unwrap();
+        let (server, orders) =
+            ControlServer::listen(folder.path().join("control"), Preparer::of_a_small_rig()).unwrap();
+        (folder, server, orders)
+    }
+
+    fn send(stream: &mut impl Write, request: &Request) {
+        let line = serde_json::to_string(request).unwrap() + "\n";
+        stream.write_all(line.as_bytes()).unwrap();
+    }
+
+    fn answer_on(stream: &Stream) -> Answer {
+        let mut line = String::new();
+        std::io::BufReader::new(stream).read_line(&mut line).unwrap();
+        serde_json::from_str(&line).unwrap()
+    }
+
+    #[test]
+    fn light_is_refused_while_a_wish_for_darkness_has_no_answer() {
+        let (_folder, server, orders) = listen();
+        let [mut dark, mut arm] = [(); 2].map(|()| Stream::connect(server.socket()).unwrap());
+        send(&mut dark, &Request::LasersDark {});
+        let wish = orders.recv_timeout(LONG).unwrap();
+        assert!(matches!(wish.order, Order::LasersDark(_)));
+        send(&mut arm, &Request::LasersArm {});
+        let refused = answer_on(&arm);
+        assert!(matches!(&refused, Answer::Error(why) if why.contains("at the same time: ask again")), "{refused:?}");
+        wish.answer.send(Answer::Ok("dark".into())).unwrap();
+        assert_eq!(answer_on(&dark), Answer::Ok("dark".into()));
+        send(&mut arm, &Request::LasersArm {});
+        assert!(matches!(orders.recv_timeout(LONG).unwrap().order, Order::LasersArm));
+    }
+
+    #[test]
+    fn of_two_connections_at_rest_the_one_that_asks_first_is_obeyed_first() {
+        let (_folder, server, orders) = listen();
+        let connect = || Stream::connect(server.socket()).unwrap();
+        let pairs: Vec<_> = (0..15).map(|_| [connect(), connect()]).collect();
+        let obey = || {
+            let Ordered { request, answer, .. } = orders.recv_timeout(LONG).unwrap();
+            answer.send(Answer::Ok("done".into())).unwrap();
+            request
+        };
+        // With an answer to this one, all have been let in.
+        let mut last = connect();
+        send(&mut last, &Request::Status {});
+        obey();
+        answer_on(&last);
+        let pupils = [3.0, 4.0].map(|mm| Request::Pupil { mm: Some(mm) });
+        for (number, pair) in pairs.iter().enumerate() {
+            pair.iter().zip(&pupils).for_each(|(mut connection, pupil)| send(&mut connection, pupil));
+            assert_eq!([obey(), obey()], pupils, "pair {number}");
+        }
+    }
+
+    #[test]
+    fn of_whoever_has_gone_only_orders_that_end_in_darkness_are_obeyed() {
+        let (sender, orders) = mpsc::channel();
+        let waiting = Arc::new(Waiting::new(Preparer::of_a_small_rig(), sender));
+        let obeyed = thread::spawn(move || {
+            let obey = |Ordered { request, answer, .. }| {
+                answer.send(Answer::Ok("done".into())).unwrap();
+                request
+            };
+            orders.into_iter().map(obey).collect::<Vec<_>>()
+        });
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let converse_over = |request: &Request, ends: &dyn Fn(Stream) -> Option<Stream>| {
+            let (mut theirs, ours) = Stream::pair().unwrap();
+            send(&mut theirs, request);
+            let theirs = ends(theirs);
+            ours.set_nonblocking(true).unwrap();
+            runtime.block_on(async {
+                let _gone = converse(UnixStream::from_std(ours).unwrap(), &waiting, &Claim::default()).await;
+            });
+            theirs.map(|theirs| answer_on(&theirs))
+        };
+        let [arm, resume] = [Request::LasersArm {}, Request::Resume {}];
+        let [dark, stop] = [Request::LasersDark {}, Request::Stop {}];
+        for request in [&arm, &resume, &dark, &stop] {
+            converse_over(request, &|_gone| None);
+        }
+        // It sends nothing more, and waits.
+        let half = |theirs: Stream| {
+            theirs.shutdown(Shutdown::Write).unwrap();
+            Some(theirs)
+        };
+        assert_eq!(converse_over(&arm, &half), Some(Answer::Ok("done".into())));
+        assert_eq!(waiting.refused.map()["unanswered"], 2);
+        drop(waiting);
+        assert_eq!(obeyed.join().unwrap(), [dark, stop, arm]);
+    }
 
     #[test]
     fn the_oldest_connection_makes_way_that_waits_for_nothing_and_last_one_that_waits_for_darkness() {

@@ -4,7 +4,9 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
+use axum::Extension;
 use axum::extract::{Request, State};
 use axum::http::header::{AUTHORIZATION, COOKIE, HOST, LOCATION, SET_COOKIE, WWW_AUTHENTICATE};
 use axum::http::{HeaderMap, HeaderValue, StatusCode};
@@ -73,6 +75,16 @@ pub(super) enum Door {
     Open,
 }
 
+/// Whether somebody has passed the door on a connection.
+#[derive(Clone, Default)]
+pub(super) struct Passed(Arc<AtomicBool>);
+
+impl Passed {
+    pub(super) fn has(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
 /// A door, and who counts those that it stops.
 pub(super) struct Doorkeeper {
     pub(super) door: Door,
@@ -129,15 +141,34 @@ impl Door {
     }
 }
 
-pub(super) async fn admit(State(keeper): State<Arc<Doorkeeper>>, request: Request, next: Next) -> Response {
+pub(super) async fn admit(
+    State(keeper): State<Arc<Doorkeeper>>,
+    Extension(passed): Extension<Passed>,
+    request: Request,
+    next: Next,
+) -> Response {
+    if is_of_another_site(request.headers()) {
+        keeper.live.refused.count(Refused::Site);
+        let said = "found a request that another site's page makes: open holod's page itself\n";
+        return (StatusCode::FORBIDDEN, said).into_response();
+    }
     match keeper.door.decide(request.uri().query(), request.headers()) {
-        Admission::In => next.run(request).await,
+        Admission::In => {
+            passed.0.store(true, Ordering::Relaxed);
+            next.run(request).await
+        }
         Admission::ByCookie(answer) => answer,
         Admission::Refused(answer) => {
             keeper.live.refused.count(keeper.door.reason());
             answer
         }
     }
+}
+
+/// Whether a browser asks for something that another site's page loads, and not for a page to show: each eye's picture
+/// is work.
+fn is_of_another_site(headers: &HeaderMap) -> bool {
+    text(headers, "sec-fetch-site") == "cross-site" && text(headers, "sec-fetch-dest") != "document"
 }
 
 /// Takes the token out of the address bar into a cookie. It comes with a link on another page, too, which the page can
@@ -207,6 +238,23 @@ mod tests {
         ] {
             assert!(!is_own_name(other), "{other}");
         }
+    }
+
+    #[test]
+    fn what_another_sites_page_loads_is_told_from_what_somebody_opens() {
+        let is_of_another = |pairs: &[(&'static str, &'static str)]| {
+            let headers = pairs.iter().map(|&(name, text)| (name.parse().unwrap(), HeaderValue::from_static(text)));
+            is_of_another_site(&headers.collect())
+        };
+        let [site, dest] = ["sec-fetch-site", "sec-fetch-dest"];
+        for loaded in ["image", "iframe", "empty"] {
+            assert!(is_of_another(&[(site, "cross-site"), (dest, loaded)]), "{loaded}");
+            assert!(!is_of_another(&[(site, "same-origin"), (dest, loaded)]), "{loaded}");
+        }
+        // A link; a bookmark; a program.
+        assert!(!is_of_another(&[(site, "cross-site"), (dest, "document")]));
+        assert!(!is_of_another(&[(site, "none"), (dest, "document")]));
+        assert!(!is_of_another(&[]));
     }
 
     #[test]

@@ -46,6 +46,8 @@ pub(super) enum Refused {
     Token,
     /// It asked for this machine by a name that is none of its own.
     Name,
+    /// Another site's page made a browser ask.
+    Site,
     /// Too many connections were open.
     Connections,
     /// Too many browsers watched.
@@ -57,12 +59,14 @@ pub(super) enum Refused {
 }
 
 impl Reason for Refused {
-    const ALL: &'static [Self] = &[Self::Token, Self::Name, Self::Connections, Self::Viewers, Self::Query, Self::Busy];
+    const ALL: &'static [Self] =
+        &[Self::Token, Self::Name, Self::Site, Self::Connections, Self::Viewers, Self::Query, Self::Busy];
 
     fn name(self) -> &'static str {
         match self {
             Self::Token => "token",
             Self::Name => "name",
+            Self::Site => "site",
             Self::Connections => "connections",
             Self::Viewers => "viewers",
             Self::Query => "query",

@@ -260,10 +260,13 @@ impl Teller<'_> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use holod_pupil_input::Rejection;
 
     use super::super::live::Refused;
     use super::*;
+    use crate::record::RecordState;
     use crate::source::feed::{ClippedPixels, FeedStatus};
 
     #[test]
@@ -290,6 +293,36 @@ mod tests {
         assert_eq!(before["holod_tracker_events_total{event=\"sequence_skipped\"}"], 3.0);
         assert_eq!(after["holod_tracker_events_total{event=\"sequence_overtaken\"}"], 1.0);
         assert!(before.iter().all(|(name, count)| after[name] >= *count), "{before:?} {after:?}");
+    }
+
+    #[test]
+    fn every_figure_stands_in_the_table_of_the_page_about_it() {
+        let live = Arc::new(Live::default());
+        let mut snapshot = Snapshot { pupil_mm: Some(3.0), ..Snapshot::default() };
+        snapshot.orders_refused = [("busy".to_owned(), 5)].into();
+        let counts =
+            ["bytes", "samples", "accepted", "sequence_gaps", "silences", "wire_bad_checksum", "rejected_blink"];
+        snapshot.figures.tracker_counts = counts.map(|name| (name.to_owned(), 1)).into();
+        snapshot.figures.record = Some(RecordState::default());
+        let mut feed = FeedStatus::default();
+        feed.connections_refused_by = [("full".to_owned(), 3)].into();
+        snapshot.figures.feed = Some(feed);
+        live.publish(&snapshot, host_now());
+        let told = text(&registry(&live));
+        let figures = told.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.split_once(' '));
+        let figures: BTreeSet<_> = figures
+            .map(|(name, kind)| match kind {
+                "counter" => format!("{name}_total"),
+                "info" => format!("{name}_info"),
+                _ => name.to_owned(),
+            })
+            .collect();
+        let page = include_str!("../../doc/page.md");
+        let rows = page.lines().filter(|line| line.starts_with("| `holod_") || line.starts_with("| `process_"));
+        let first_cells = rows.filter_map(|row| row.split('|').nth(1));
+        let named = first_cells.flat_map(|cell| cell.split('`').skip(1).step_by(2));
+        let named: BTreeSet<_> = named.map(|name| name.split('{').next().unwrap_or_default().to_owned()).collect();
+        assert_eq!(named, figures);
     }
 
     #[test]

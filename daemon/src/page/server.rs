@@ -17,7 +17,7 @@ use axum::http::{HeaderName, HeaderValue, StatusCode};
 use axum::middleware::{from_fn_with_state, map_response};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use axum::{Json, Router};
+use axum::{Extension, Json, Router};
 use holod_calibration::{Dioptres, host_now};
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -29,13 +29,13 @@ use serde::Deserialize;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, UnixListener};
 use tokio::runtime::Runtime;
-use tokio::sync::Semaphore;
+use tokio::task::AbortHandle;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError;
 
 use super::address::PageAddress;
-use super::door::{Door, Doorkeeper, Token, admit};
+use super::door::{Door, Doorkeeper, Passed, Token, admit};
 use super::eye::{Blind, EyeDesk, Gaze};
 use super::give_up::GivesUp;
 use super::live::{Live, Refused, Viewer};
@@ -46,7 +46,7 @@ use crate::session::scheduling;
 use crate::snapshot::SnapshotNow;
 use crate::status::stale;
 
-/// Connections at once; further ones are closed. A browser has up to six.
+/// Connections at once; a further one takes the place of one on which nobody has passed the door. A browser has up to six.
 const CONNECTIONS: usize = 256;
 /// Browsers that watch at once; each further one is told so.
 const VIEWERS: usize = 64;
@@ -187,7 +187,7 @@ impl Listener {
 }
 
 async fn serve(mut listener: Listener, router: Router, live: Arc<Live>, patience: Duration) {
-    let connections = Arc::new(Semaphore::new(CONNECTIONS));
+    let mut connections: Vec<(AbortHandle, Passed)> = Vec::new();
     loop {
         let Ok(accepted) = tokio::time::timeout(LOOK, listener.accept()).await else {
             listener.look_after_socket();
@@ -198,18 +198,21 @@ async fn serve(mut listener: Listener, router: Router, live: Arc<Live>, patience
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
-        let Ok(place) = Arc::clone(&connections).try_acquire_owned() else {
+        connections.retain(|(task, _)| !task.is_finished());
+        if connections.len() == CONNECTIONS {
             live.refused.count(Refused::Connections);
-            continue;
-        };
-        let service = TowerToHyperService::new(router.clone());
-        tokio::spawn(async move {
-            let _place = place;
+            let Some(oldest) = connections.iter().position(|(_, passed)| !passed.has()) else { continue };
+            connections.remove(oldest).0.abort();
+        }
+        let passed = Passed::default();
+        let service = TowerToHyperService::new(router.clone().layer(Extension(passed.clone())));
+        let connection = tokio::spawn(async move {
             let mut server = http1::Builder::new();
             server.timer(TokioTimer::new()).header_read_timeout(patience);
             // A client that has gone away is no fault.
             let _gone = server.serve_connection(TokioIo::new(GivesUp::new(stream, patience)), service).await;
         });
+        connections.push((connection.abort_handle(), passed));
     }
 }
 
@@ -244,15 +247,16 @@ fn file(kind: &'static str, content: &'static str) -> axum::routing::MethodRoute
     get(async move || ([(CONTENT_TYPE, kind)], content))
 }
 
-/// Nothing from elsewhere is loaded, nothing is kept, no other site may frame the page.
+/// Nothing from elsewhere is loaded, nothing is kept, no other site may frame the page or show what is on it.
 async fn guarded(mut response: Response) -> Response {
     let policy =
         "default-src 'self'; img-src 'self' blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
-    let headers: [(HeaderName, &'static str); 4] = [
+    let headers: [(HeaderName, &'static str); 5] = [
         (CONTENT_SECURITY_POLICY, policy),
         (X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (REFERRER_POLICY, "no-referrer"),
         (CACHE_CONTROL, "no-store"),
+        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
     ];
     for (name, value) in headers {
         response.headers_mut().insert(name, HeaderValue::from_static(value));
@@ -365,11 +369,15 @@ mod tests {
 
     /// Serves `live` at a socket.
     fn served(path: &std::path::Path, live: &Arc<Live>, patience: Duration) -> Runtime {
+        served_behind(Door::Open, path, live, patience)
+    }
+
+    fn served_behind(door: Door, path: &std::path::Path, live: &Arc<Live>, patience: Duration) -> Runtime {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_io().enable_time().build().unwrap();
         let inside = runtime.enter();
         let (listener, ..) = Listener::bind(&PageAddress::Unix(path.to_owned())).unwrap();
-        let router = router(Door::Open, Arc::clone(live), EyeDesk::default());
+        let router = router(door, Arc::clone(live), EyeDesk::default());
         runtime.spawn(serve(listener, router, Arc::clone(live), patience));
         drop(inside);
         runtime
@@ -398,6 +406,31 @@ mod tests {
         assert!(old.contains("\"stale_s\":6"), "{old}");
         let figures = get("/metrics");
         assert!(figures.starts_with("HTTP/1.1 200") && figures.contains("\nholod_snapshot_age_seconds 6"), "{figures}");
+    }
+
+    #[test]
+    fn connections_that_say_nothing_or_have_no_token_make_way_for_whoever_has_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("page");
+        let live = Arc::new(Live::default());
+        let _runtime = served_behind(Door::Token(Token("0123456789abcdef".into())), &path, &live, PATIENCE);
+        let ask = |page: &str, token: &str| {
+            let mut stream = UnixStream::connect(&path).unwrap();
+            write!(stream, "GET {page} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {token}\r\n\r\n").unwrap();
+            let mut head = [0; 12];
+            let _closed = stream.read_exact(&mut head);
+            (stream, String::from_utf8_lossy(&head).into_owned())
+        };
+        let (viewer, watches) = ask("/events", "0123456789abcdef");
+        assert_eq!(watches, "HTTP/1.1 200");
+        let mut strangers = Vec::new();
+        for _ in 0..CONNECTIONS / 2 {
+            strangers.push(UnixStream::connect(&path).unwrap());
+            strangers.push(ask("/metrics", "none").0);
+        }
+        assert_eq!(ask("/metrics", "0123456789abcdef").1, "HTTP/1.1 200");
+        assert_eq!(live.viewers.load(Ordering::Relaxed), 1, "the viewer keeps its place");
+        drop((viewer, strangers));
     }
 
     #[test]

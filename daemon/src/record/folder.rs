@@ -2,11 +2,13 @@
 //! taken its place. Until then it waits in a hidden folder beside, whose name says how far that is: what a run that was
 //! killed leaves is put right by the next one that records there.
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::SystemTime;
 
+use super::place::Place;
 use super::sources::{self, BENCH};
 use super::{FILES, shown_levels};
 use crate::failure::{Exit, Failure};
@@ -23,14 +25,13 @@ const REPLACED: &str = ".holod-earlier-replaced";
 /// named again, and puts an earlier record back, unless it was told to [keep](Self::keep) them.
 #[derive(Debug)]
 pub(crate) struct RecordFolder {
-    path: PathBuf,
+    /// Locked while somebody records there.
+    place: Arc<Place>,
     /// Nothing was there before.
     is_new: bool,
     /// An earlier record waits for what becomes of this one.
     earlier_waits: bool,
     is_kept: bool,
-    /// Locked while somebody records there.
-    _lock: File,
 }
 
 impl RecordFolder {
@@ -43,8 +44,8 @@ impl RecordFolder {
         let cannot = |error: io::Error| refused(path, error, "--record");
         let is_new = !path.exists();
         fs::create_dir_all(path).map_err(cannot)?;
-        let lock = File::open(path).map_err(cannot)?;
-        match lock.try_lock() {
+        let place = Place::hold(path).map_err(cannot)?;
+        match place.lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
                 let found = format!("cannot record into {}: another holod records there", path.display());
@@ -55,16 +56,17 @@ impl RecordFolder {
                 tracing::warn!("{}: cannot find out whether another holod records there: {error}", path.display());
             }
         }
-        restore(path).map_err(cannot)?;
-        let earlier = files_of(path).map_err(cannot)?;
+        let itself = place.itself();
+        restore(&itself).map_err(cannot)?;
+        let earlier = files_of(&itself).map_err(cannot)?;
         refuse_existing(earlier.iter().map(|file| path.join(file)).chain([path.join(BENCH)]), "--record", force)?;
         if !earlier.is_empty() {
-            set_aside(path).map_err(|error| match restore(path) {
+            set_aside(&itself).map_err(|error| match restore(&itself) {
                 Ok(()) => cannot(error),
                 Err(_) => cannot(io::Error::new(error.kind(), format!("{error}; part of it is in {MOVING} there"))),
             })?;
         }
-        Ok(Self { path: path.to_owned(), is_new, earlier_waits: !earlier.is_empty(), is_kept: false, _lock: lock })
+        Ok(Self { place: Arc::new(place), is_new, earlier_waits: !earlier.is_empty(), is_kept: false })
     }
 
     /// Refuses inputs of a run that are files of the record at `path`, which [`Self::claim`] with `force` would move
@@ -117,9 +119,14 @@ impl RecordFolder {
         Ok(folder)
     }
 
-    /// Where it is.
+    /// Where it was when it was claimed.
     pub(crate) fn path(&self) -> &Path {
-        &self.path
+        self.place.path()
+    }
+
+    /// The folder itself.
+    pub(super) fn place(&self) -> Arc<Place> {
+        Arc::clone(&self.place)
     }
 
     /// Whether there is an earlier record whose place this one has not taken.
@@ -133,15 +140,16 @@ impl RecordFolder {
     /// The earlier one cannot be moved, and will be put back.
     pub(crate) fn keep(&mut self) -> Result<(), Failure> {
         if self.earlier_waits {
-            let replaced = self.path.join(REPLACED);
-            fs::rename(self.path.join(EARLIER), &replaced).map_err(|error| {
-                let what = format!("cannot take the place of the earlier record in {}: {error}", self.path.display());
+            let path = self.path().display();
+            let [earlier, replaced] = [EARLIER, REPLACED].map(|name| self.place.itself().join(name));
+            fs::rename(earlier, &replaced).map_err(|error| {
+                let what = format!("cannot take the place of the earlier record in {path}: {error}");
                 Failure::new(Exit::CannotCreate, what)
             })?;
-            self.earlier_waits = false;
             if let Err(error) = fs::remove_dir_all(&replaced) {
-                tracing::warn!("the earlier record stays in {}: {error}; take it away", replaced.display());
+                tracing::warn!("the earlier record stays in {path}/{REPLACED}: {error}; take it away");
             }
+            self.earlier_waits = false;
         }
         self.is_kept = true;
         Ok(())
@@ -149,12 +157,12 @@ impl RecordFolder {
 
     fn give_up(&self) -> io::Result<()> {
         if self.earlier_waits {
-            return restore(&self.path);
+            return restore(&self.place.itself());
         }
-        remove_files(&self.path)?;
-        if self.is_new {
+        remove_files(&self.place.itself())?;
+        if self.is_new && self.place.moved_to().is_none() {
             // Fails where something else is in it, which then stays.
-            let _ = fs::remove_dir(&self.path);
+            let _ = fs::remove_dir(self.path());
         }
         Ok(())
     }
@@ -165,7 +173,7 @@ impl Drop for RecordFolder {
         if self.is_kept {
             return;
         }
-        let path = self.path.display();
+        let path = self.path().display();
         match self.give_up() {
             Err(error) if self.earlier_waits => {
                 tracing::error!(
@@ -418,6 +426,44 @@ mod tests {
         }
         for name in ["own.toml", "scene", "missing", ".."] {
             judge(name).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_folder_that_was_moved_is_put_right_where_it_is_and_what_came_to_its_path_stays() {
+        let root = tempfile::tempdir().unwrap();
+        let [path, elsewhere] = ["record", "elsewhere"].map(|name| root.path().join(name));
+        for is_deleted in [false, true] {
+            let given_up = RecordFolder::claim(&path, false).unwrap();
+            put(&path, &OF_RECORD, "mine");
+            if is_deleted {
+                fs::remove_dir_all(&path).unwrap()
+            } else {
+                fs::rename(&path, &elsewhere).unwrap()
+            }
+            let mut other = RecordFolder::claim(&path, false).unwrap();
+            put(&path, &OF_RECORD, "another's");
+            drop(given_up);
+            assert!(holds(&path, &OF_RECORD, "another's") && holds_none(&elsewhere, &OF_RECORD));
+            other.keep().unwrap();
+            fs::remove_dir_all(&path).unwrap();
+        }
+        // An earlier record goes, and comes back, in its own folder.
+        for is_kept in [false, true] {
+            let _cleared = fs::remove_dir_all(&elsewhere);
+            put(&path, &OF_RECORD, "earlier");
+            let mut folder = RecordFolder::claim(&path, true).unwrap();
+            fs::rename(&path, &elsewhere).unwrap();
+            put(&elsewhere, &OF_RECORD, "mine");
+            put(&path.join(EARLIER), &OF_RECORD, "another's");
+            if is_kept {
+                folder.keep().unwrap();
+            }
+            drop(folder);
+            assert!(holds(&path.join(EARLIER), &OF_RECORD, "another's"));
+            assert!(holds(&elsewhere, &OF_RECORD, if is_kept { "mine" } else { "earlier" }));
+            assert!(!elsewhere.join(EARLIER).exists());
+            fs::remove_dir_all(&path).unwrap();
         }
     }
 

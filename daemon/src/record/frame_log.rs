@@ -3,12 +3,12 @@
 use std::collections::HashMap;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::TimeNs;
 
 use super::health::lost;
+use super::place::judge_file;
 use super::sources::hash_text;
 use super::{FRAMES, FieldRecord, FrameRecord, ORDERS};
 use crate::control::Request;
@@ -63,8 +63,8 @@ pub(crate) struct FrameLog {
     frames: HashMap<u64, FrameRecord>,
     /// The frame of the last row.
     newest: Option<u64>,
-    /// Its path leads elsewhere.
-    is_moved: bool,
+    /// `orders.jsonl`, once there is something in it.
+    orders: Option<File>,
 }
 
 /// A file that takes nothing more once it has refused something: csv's writer keeps what was refused, of which the
@@ -120,7 +120,7 @@ impl FrameLog {
 
     fn of(file: File, path: PathBuf) -> Self {
         let rows = csv::Writer::from_writer(UntilRefused { file, has_refused: false });
-        Self { rows, path, frames: HashMap::new(), newest: None, is_moved: false }
+        Self { rows, path, frames: HashMap::new(), newest: None, orders: None }
     }
 
     /// Takes note of a rendered frame; its rows are written when its fields are shown.
@@ -151,44 +151,32 @@ impl FrameLog {
     ///
     /// # Errors
     /// The disk's, with the file's name.
-    pub(crate) fn order(&self, t: TimeNs, request: &Request) -> Result<(), Failure> {
-        let path = self.path.with_file_name(ORDERS);
+    pub(crate) fn order(&mut self, t: TimeNs, request: &Request) -> Result<(), Failure> {
+        let path = self.orders_path();
         let line = serde_json::json!({ "t_ns": t.0, "request": request });
-        let file = OpenOptions::new().create(true).append(true).open(&path);
-        file.and_then(|mut file| writeln!(file, "{line}")).map_err(|error| lost(&path, &error))
+        let write = |orders: &mut Option<File>| {
+            let file = match orders.take() {
+                Some(file) => file,
+                None => OpenOptions::new().create_new(true).append(true).open(&path)?,
+            };
+            writeln!(orders.insert(file), "{line}")
+        };
+        write(&mut self.orders).map_err(|error| lost(&path, &error))
     }
 
     /// Hands everything to the operating system.
     ///
     /// # Errors
-    /// The disk's, with the file's name.
+    /// The disk's, with the file's name; a file that is not in its place any more.
     pub(crate) fn flush(&mut self) -> Result<(), Failure> {
-        let metadata = self.rows.flush().and_then(|()| self.rows.get_ref().file.metadata());
-        let metadata = metadata.map_err(|error| self.lost(&error))?;
-        // What is written into a file without a name is lost when it is closed.
-        if metadata.nlink() == 0 {
-            return Err(self.lost(&io::Error::new(io::ErrorKind::NotFound, "the file was deleted")));
-        }
-        self.look_for(&metadata);
-        Ok(())
+        let flushed = self.rows.flush().and_then(|()| judge_file(&self.rows.get_ref().file, &self.path));
+        flushed.map_err(|error| self.lost(&error))?;
+        let path = self.orders_path();
+        self.orders.as_ref().map_or(Ok(()), |orders| judge_file(orders, &path)).map_err(|error| lost(&path, &error))
     }
 
-    /// Says once that the folder was moved: rows go on in it, but what is written by its path is missing at the end.
-    fn look_for(&mut self, written: &fs::Metadata) {
-        let is_moved = match fs::metadata(&self.path) {
-            Ok(found) => (found.dev(), found.ino()) != (written.dev(), written.ino()),
-            Err(error) => error.kind() == io::ErrorKind::NotFound,
-        };
-        let path = self.path.display();
-        match (self.is_moved, is_moved) {
-            (false, true) => tracing::warn!(
-                "{path} is not where this run records any more: rows go on in the folder that was moved, but orders and \
-                 the summary will be missing in it; move it back, and leave a record where it is until its run is over"
-            ),
-            (true, false) => tracing::info!("{path} is back"),
-            _ => {}
-        }
-        self.is_moved = is_moved;
+    fn orders_path(&self) -> PathBuf {
+        self.path.with_file_name(ORDERS)
     }
 
     /// Whether no frame was ever made.
@@ -322,7 +310,7 @@ mod tests {
     #[test]
     fn orders_stand_beside_the_frames_one_to_a_line() {
         let folder = tempfile::tempdir().unwrap();
-        let log = FrameLog::create(folder.path()).unwrap();
+        let mut log = FrameLog::create(folder.path()).unwrap();
         log.order(TimeNs(5), &Request::Pupil { mm: Some(3.5) }).unwrap();
         log.order(TimeNs(6), &Request::LasersDark {}).unwrap();
         let text = fs::read_to_string(folder.path().join("orders.jsonl")).unwrap();
@@ -332,36 +320,24 @@ mod tests {
     }
 
     #[test]
-    fn a_record_that_is_deleted_is_noticed_when_it_is_flushed() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut log = FrameLog::create(&folder.path().join("record")).unwrap();
-        log.flush().unwrap();
-        fs::remove_dir_all(folder.path().join("record")).unwrap();
-        let failure = log.flush().unwrap_err();
-        assert_eq!(failure.exit, Exit::CannotCreate);
-        assert!(failure.to_string().contains("frames.csv: the file was deleted"), "{failure}");
-    }
-
-    #[test]
-    fn a_record_that_is_moved_goes_on_and_is_noticed_until_it_is_back() {
-        let folder = tempfile::tempdir().unwrap();
-        let [record, elsewhere] = ["record", "elsewhere"].map(|name| folder.path().join(name));
-        let mut log = FrameLog::create(&record).unwrap();
-        let is_moved = |log: &mut FrameLog| {
-            log.flush().unwrap();
-            log.is_moved
-        };
-        assert!(!is_moved(&mut log));
-        fs::rename(&record, &elsewhere).unwrap();
-        assert!(is_moved(&mut log));
-        fs::create_dir(&record).unwrap();
-        fs::write(record.join(FRAMES), "another").unwrap();
-        assert!(is_moved(&mut log));
-        fs::remove_dir_all(&record).unwrap();
-        fs::rename(&elsewhere, &record).unwrap();
-        log.field(&field(7)).unwrap();
-        assert!(!is_moved(&mut log));
-        assert_eq!(fs::read_to_string(record.join(FRAMES)).unwrap().lines().count(), 2);
+    fn a_file_that_is_deleted_or_moved_is_noticed_when_it_is_flushed() {
+        for missing in [FRAMES, ORDERS] {
+            for is_deleted in [true, false] {
+                let folder = tempfile::tempdir().unwrap();
+                let mut log = FrameLog::create(folder.path()).unwrap();
+                log.order(TimeNs(5), &Request::LasersDark {}).unwrap();
+                log.flush().unwrap();
+                let path = folder.path().join(missing);
+                if is_deleted { fs::remove_file(&path) } else { fs::rename(&path, folder.path().join("old")) }.unwrap();
+                // No file is made anew, whose first line would be another order's.
+                log.order(TimeNs(6), &Request::LasersArm {}).unwrap();
+                assert!(!path.exists());
+                let failure = log.flush().unwrap_err();
+                assert_eq!(failure.exit, Exit::CannotCreate);
+                let expected = format!("{missing}: the file was deleted or moved; leave a record where it is");
+                assert!(failure.to_string().contains(&expected), "{failure}");
+            }
+        }
     }
 
     #[test]

@@ -14,6 +14,7 @@ use holod_calibration::{DisplayGeometry, Resolution, TimeNs, host_now};
 use holod_slm_output::FieldEvent;
 use serde::{Deserialize, Serialize};
 
+use super::place::Place;
 use super::sources::{self, SceneSource, SourceFile, weights_file};
 use super::{FieldRecord, FrameLog, FrameRecord, RecordFolder, RecordHealth};
 use crate::aside::{Queue, Taking, join_within};
@@ -103,7 +104,7 @@ struct Writing {
 
 /// Writes down a run as it goes.
 pub(crate) struct Recorder {
-    folder: PathBuf,
+    place: Arc<Place>,
     log: LogFile,
     facts: RunFacts,
     named: Named,
@@ -138,13 +139,15 @@ impl Recorder {
         rig: &Rig,
         resolution: Resolution,
     ) -> Result<Self, Failure> {
-        let path = folder.path().to_owned();
-        let frames = FrameLog::create(&path)?;
-        let (log, facts) = Self::start(&path, args, rig, resolution)?;
+        let place = folder.place();
+        let itself = place.itself();
+        let told = |failure| place.told(&failure);
+        let frames = FrameLog::create(&itself).map_err(told)?;
+        let (log, facts) = Self::start(&itself, args, rig, resolution).map_err(told)?;
         let entries = Arc::new(Queue::default());
-        let health = Arc::new(RecordHealth::new(&path));
+        let health = Arc::new(RecordHealth::new(Arc::clone(&place)));
         let write = {
-            let (entries, health, run) = (Arc::clone(&entries), Arc::clone(&health), path.join(RUN));
+            let (entries, health, run) = (Arc::clone(&entries), Arc::clone(&health), itself.join(RUN));
             move || write_entries(&entries, Writing { frames, folder }, &run, &health)
         };
         let writer = thread::Builder::new()
@@ -152,7 +155,7 @@ impl Recorder {
             .spawn(write)
             .map_err(Failure::because(Exit::Unavailable))?;
         Ok(Self {
-            folder: path,
+            place,
             log,
             facts,
             named: Named { rig: args.rig.clone(), network: args.network.clone(), geometry: rig.geometry, resolution },
@@ -166,9 +169,9 @@ impl Recorder {
         })
     }
 
-    /// Where the record is.
-    pub(crate) fn folder(&self) -> &Path {
-        &self.folder
+    /// A path to the record's folder, wherever that is moved, for as long as this lives or its health.
+    pub(crate) fn folder(&self) -> PathBuf {
+        self.place.itself()
     }
 
     /// Whether the record goes on, for others who write into its folder, and who ask.
@@ -213,7 +216,7 @@ impl Recorder {
         self.note_log();
         let Some(Writing { folder, .. }) = &mut self.written else { return false };
         if folder.earlier_waits() {
-            tracing::warn!("no frame was recorded: the earlier record in {} stays", self.folder.display());
+            tracing::warn!("no frame was recorded: the earlier record in {} stays", self.place.path().display());
             return false;
         }
         if let Err(failure) = folder.keep() {
@@ -223,12 +226,14 @@ impl Recorder {
     }
 
     /// Ends the record of a run that failed. Where no frame was ever made it is taken away again, so that the same
-    /// directory may be named again.
-    pub(crate) fn fail(mut self, failure: &Failure) {
+    /// directory may be named again. The failure as it is to be told.
+    pub(crate) fn fail(mut self, failure: &Failure) -> Failure {
+        let failure = self.place.told(failure);
         let writing = self.end_writing();
-        self.log.ended_by(failure);
+        self.log.ended_by(&failure);
         self.log.end();
         drop(writing);
+        failure
     }
 
     fn end_writing(&mut self) -> Option<Writing> {
@@ -239,7 +244,7 @@ impl Recorder {
         }
         let writing = join_within(self.writer.take()?, FINISH);
         if writing.is_none() {
-            let folder = self.folder.display();
+            let folder = self.place.path().display();
             self.health.give_up(&format!("the disk of {folder} does not take what was left within {FINISH:?}"));
         }
         writing
@@ -263,7 +268,7 @@ impl Recorder {
     fn tell_slowness(&mut self) {
         let lost = self.health.rows_lost();
         let Slowness { seen, told } = &mut self.slowness;
-        let folder = self.folder.display();
+        let folder = self.place.path().display();
         if lost > *seen && *seen == *told {
             tracing::warn!("the disk of {folder} is too slow for the record: rows are left out until it has caught up");
         } else if lost == *seen && *seen > *told {
@@ -288,13 +293,14 @@ impl Recorder {
             return;
         }
         let before = self.reading.take();
-        let path = self.folder.join(ORDER_FILES);
+        let place = Arc::clone(&self.place);
         let read = move || {
             // One after another, so that lines are whole.
             if let Some(before) = before {
                 let _ = before.join();
             }
-            let noted = order_source(order, &request, &named).and_then(|source| append(&path, &source));
+            let noted = order_source(order, &request, &named)
+                .and_then(|source| append(&place.itself().join(ORDER_FILES), &source));
             if let Err(failure) = noted {
                 tracing::warn!("the record lacks the files of order {order}: {failure}");
             }
@@ -361,8 +367,9 @@ fn write_entries(entries: &Queue<Entry>, mut writing: Writing, run: &Path, healt
         };
         let written = taken.drain(..).try_for_each(&mut write).and_then(|()| frames.flush());
         let kept = written.and_then(|()| if frames.is_empty() { Ok(()) } else { folder.keep() });
-        if let Err(failure) = kept {
-            health.give_up(&failure.to_string());
+        match kept {
+            Ok(()) => health.look_for_folder(),
+            Err(failure) => health.give_up(&failure.to_string()),
         }
     }
     writing
@@ -393,7 +400,7 @@ impl Observer for Recorder {
         }
         self.note_files(request);
         if !self.entries.put(Entry::Order(t, Box::new(request.clone())), ROWS + ORDERS_ROOM) {
-            self.health.give_up(&format!("the disk of {} is too slow for its orders", self.folder.display()));
+            self.health.give_up(&format!("the disk of {} is too slow for its orders", self.place.path().display()));
         }
         Ok(())
     }
@@ -553,7 +560,7 @@ mod tests {
             thread::sleep(WRITE_INTERVAL);
         }
         let reason = recorder.health.state().reason.expect("it is noticed");
-        assert!(reason.contains("frames.csv: the file was deleted; leave a record where it is"), "{reason}");
+        assert!(reason.contains("frames.csv: the file was deleted or moved; leave a record where it is"), "{reason}");
         for number in 0..3 * ROWS as u64 {
             recorder.frame(&frame(number)).unwrap();
         }

@@ -427,6 +427,10 @@ impl Server {
         let client = &mut self.clients[index].1;
         let Err(gone) = act(client, &self.target, &mut self.status) else { return };
         let (_, client) = self.clients.remove(index);
+        if self.clients.is_empty() {
+            // Its memory may be large.
+            self.copied = Copied::default();
+        }
         self.left_out_of_gone = self.left_out_of_gone.saturating_add(client.left_out());
         match gone {
             Gone::Closed => self.status.tell(&format!("the feed's client `{}` is gone", client.name)),
@@ -509,7 +513,7 @@ impl Server {
         if is_shown {
             self.shown_last = Some(number);
         }
-        // Its memory may be large.
+        // It may just have been the last client's.
         if !self.clients.is_empty() {
             self.copied = copied;
         }
