@@ -13,6 +13,9 @@ pub const STATED_LAG: TimeNs = TimeNs(50_000_000);
 
 /// A first believed sample this soon after the begin is shown at once: hardly anything was shown before.
 const SHOWN_AT_ONCE: TimeNs = TimeNs(500_000_000);
+/// Longer than a lid that is slow takes to show as one: where the pupil was, is asked so long before the newest sample,
+/// and at most twice as long.
+const EARLIER: TimeNs = TimeNs(100_000_000);
 /// What was slid to is reached when no more than this is left.
 const REACHED_MM: f32 = 0.1;
 
@@ -312,6 +315,8 @@ struct Channel {
     filter: Filter,
     /// The newest sample that the filter has taken.
     believed: Option<Measured>,
+    /// The filter's diameter [`EARLIER`] before that sample or longer, and one that comes to be as old.
+    earlier: [Option<Measured>; 2],
     /// Added to this eye's diameter to give the mean of the eyes, as learnt while there were two.
     to_mean_mm: f32,
     /// Trusted now: believed at least once, and neither a bad sample nor a long silence since.
@@ -329,12 +334,35 @@ impl Channel {
             gate: Gate::new(settings.gate),
             filter: Filter::new(settings.filter),
             believed: None,
+            earlier: [None; 2],
             to_mean_mm: 0.0,
             live: false,
             t_changed: TimeNs(0),
             t_latest: TimeNs(0),
             confidence: 0.0,
         }
+    }
+
+    /// Has the filter take a sample that is believed.
+    fn believe(&mut self, sample: &PupilSample) {
+        let (t, diameter_mm) = (sample.t_sample, sample.diameter_mm);
+        self.filter.update(t, diameter_mm, self.gate.noise_mm());
+        self.believed = Some(Measured { t, diameter_mm });
+        // What comes back from a loss is known anew.
+        let [earlier, later] = if self.live { self.earlier } else { [None; 2] };
+        if later.is_none_or(|later| t - later.t >= EARLIER) {
+            let now = self.filter.motion().map(|motion| Measured { t, diameter_mm: motion.diameter_mm });
+            self.earlier = [later.or(earlier), now];
+        }
+    }
+
+    /// Where this eye's pupil is expected at `t`.
+    fn expected(&self, t: TimeNs) -> Option<Expected> {
+        let motion = self.filter.motion()?;
+        let diameter_mm = motion.at(t).diameter_mm;
+        let [earlier, later] = self.earlier;
+        let earlier_mm = earlier.or(later).map_or(diameter_mm, |earlier| earlier.diameter_mm);
+        Some(Expected { diameter_mm, earlier_mm, t_believed: motion.t })
     }
 
     fn note_confidence(&mut self, t: TimeNs, confidence: f32, recent: TimeNs) {
@@ -411,15 +439,11 @@ impl Estimator {
         let lives_before = channel.live;
         let mut believed = false;
         while let Some(ripe) = channel.gate.ripe(t) {
-            channel.filter.update(ripe.t_sample, ripe.diameter_mm, channel.gate.noise_mm());
-            channel.believed = Some(Measured { t: ripe.t_sample, diameter_mm: ripe.diameter_mm });
+            channel.believe(&ripe);
             believed = true;
             on_decision(Decision { sample: ripe, verdict: Verdict::Accepted });
         }
-        let expected = channel
-            .filter
-            .motion()
-            .map(|motion| Expected { diameter_mm: motion.at(t).diameter_mm, t_believed: motion.t });
+        let expected = channel.expected(t);
         let mut fault = None;
         channel.gate.judge(sample, expected, |sample, reason| {
             fault = (reason != Rejection::Guard).then_some(reason).or(fault);

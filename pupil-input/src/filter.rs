@@ -2,7 +2,8 @@
 //!
 //! dx = v dt, dv = −v/τ dt + white acceleration. Between samples and beyond the newest one the position runs on by
 //! v·τ·(1 − exp(−Δt/τ)): it extrapolates over the gate's latency and comes to rest where nothing more is heard, so a
-//! hold needs no case of its own. What is run on is less than the velocity v where that is small. (The integrated
+//! hold needs no case of its own: a reflex goes on behind a blink. Whether the velocity may have been a lid's is for
+//! the gate to judge. What is run on is less than the velocity v where that is small. (The integrated
 //! Ornstein-Uhlenbeck model; Singer 1970 has it one derivative higher.)
 
 use holod_calibration::TimeNs;

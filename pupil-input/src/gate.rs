@@ -5,9 +5,13 @@
 //!
 //! 1. its diameter is in range, its confidence is high enough, and the lids (where known) are open: as wide as that eye
 //!    holds them open, since in bright light people squint all the time;
-//! 2. it did not step from its predecessor faster than a pupil moves, beyond what the tracker's own noise explains;
-//! 3. it lies within reach of the estimate: a band that widens with the time since the last believed sample, so that
-//!    a dip of a lid is outside for longer than a blink lasts, and a real change of the pupil is inside soon after;
+//! 2. it did not step from its predecessor, nor move from the oldest sample that waits, faster than a pupil moves,
+//!    beyond what the tracker's own noise explains: at a high rate a lid's steps are small, and its speed shows over
+//!    the whole wait only;
+//! 3. it lies within reach of the estimate, of where the pupil was a while ago, or of what is between: a band that
+//!    widens with the time since the last believed sample, so that a dip of a lid is outside for longer than a blink
+//!    lasts, and a real change of the pupil is inside soon after. The estimate alone would not do: where it began to
+//!    follow a lid and runs on, the pupil itself lies outside;
 //! 4. none of this happened within the guard times around it. The leading guard needs the sample's successors, so every
 //!    sample waits for [`GateSettings::lead`] before it is believed: that is the gate's whole latency, and because of
 //!    it the estimate never starts to follow the onset of a blink.
@@ -35,7 +39,8 @@ pub struct GateSettings {
     pub aperture_settles: TimeNs,
     /// Fastest change of a pupil, millimetres a second, noise aside.
     pub slew_mm_per_s: f32,
-    /// How far from the estimate a sample may lie when the last believed one is fresh.
+    /// How far from the estimate, or from what it was a while ago, a sample may lie when the last believed one is
+    /// fresh.
     pub reach_mm: f32,
     /// How fast that reach widens, millimetres a second.
     pub reach_mm_per_s: f32,
@@ -87,7 +92,7 @@ pub enum Rejection {
     LowConfidence,
     /// The lids are nearly closed.
     LidsClosed,
-    /// It stepped faster than a pupil moves.
+    /// It stepped, or moved since the oldest sample that waits, faster than a pupil moves.
     Slew,
     /// It is out of reach of the estimate.
     OutOfReach,
@@ -147,6 +152,8 @@ pub enum Verdict {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Expected {
     pub(crate) diameter_mm: f32,
+    /// Where the pupil was before a lid that only begins to show could have moved the estimate.
+    pub(crate) earlier_mm: f32,
     /// Time of the last believed sample.
     pub(crate) t_believed: TimeNs,
 }
@@ -305,10 +312,20 @@ impl Gate {
                 return Some(Rejection::Slew);
             }
         }
+        if let Some(oldest) = self.pending[self.oldest].filter(|_| self.waiting > 0) {
+            let (elapsed, moved) = (t - oldest.t_sample, (sample.diameter_mm - oldest.diameter_mm).abs());
+            let allowed = self.step.noise_alone_mm() + self.settings.slew_mm_per_s * elapsed.seconds() as f32;
+            if 2 * elapsed.0 >= self.settings.lead.0 && moved > allowed {
+                return Some(Rejection::Slew);
+            }
+        }
         let expected = expected?;
         let reach = self.settings.reach_mm.max(noise)
             + self.settings.reach_mm_per_s * (t - expected.t_believed).seconds() as f32;
-        ((sample.diameter_mm - expected.diameter_mm).abs() > reach).then_some(Rejection::OutOfReach)
+        let nearest_mm = sample
+            .diameter_mm
+            .clamp(expected.diameter_mm.min(expected.earlier_mm), expected.diameter_mm.max(expected.earlier_mm));
+        ((sample.diameter_mm - nearest_mm).abs() > reach).then_some(Rejection::OutOfReach)
     }
 }
 
@@ -360,10 +377,15 @@ impl StepScale {
         }
     }
 
-    /// A step that noise alone all but never makes: about six times the median, which for normal noise is the step's
-    /// four-sigma point.
+    /// A distance between two samples that noise alone all but never makes: about six times the median step, which for
+    /// normal noise is its four-sigma point.
+    fn noise_alone_mm(self) -> f32 {
+        (6.0 * self.median_mm).clamp(0.05, 0.9)
+    }
+
+    /// The same for neighbours, of which a quiet tracker makes a coarse step now and then.
     fn allowance_mm(self) -> f32 {
-        (6.0 * self.median_mm).clamp(0.3, 0.9)
+        self.noise_alone_mm().max(0.3)
     }
 
     /// For normal noise the median absolute step is 0.6745·√2 of one sample's standard deviation.
@@ -424,7 +446,8 @@ mod tests {
         let mut out = Vec::new();
         for &sample in samples {
             while let Some(ripe) = gate.ripe(sample.t_sample) {
-                expected = Some(Expected { diameter_mm: ripe.diameter_mm, t_believed: ripe.t_sample });
+                let diameter_mm = ripe.diameter_mm;
+                expected = Some(Expected { diameter_mm, earlier_mm: diameter_mm, t_believed: ripe.t_sample });
                 out.push((ripe.t_sample.0 / 1_000_000, Verdict::Accepted));
             }
             gate.judge(sample, expected, |sample, reason| {

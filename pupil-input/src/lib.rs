@@ -23,8 +23,8 @@
 //! | after a blink, until samples are believed again | 50 ms trailing guard and 30 ms lead |
 //! | a step no pupil can make (a lid, or a change missed) of 1.5 mm is believed after | about 0.6 s |
 //!
-//! Flicker in pixels of blur, the error of predictions, and how other filters do: `doc/estimate.md`. Scenarios of the
-//! simulated eye: [`Script`].
+//! Flicker in pixels of blur, the error of predictions and through blinks, and how other filters do:
+//! `doc/estimate.md`. Scenarios of the simulated eye: [`Script`].
 //!
 //! A pupil is held for as long as the rig says ([`rig::Tracker::hold`](holod_calibration::rig::Tracker::hold)), then
 //! slides to the fallback at 1.3 mm/s; when samples come back, what is shown meets them at 4 mm/s. Neither is

@@ -125,10 +125,15 @@ impl Trace {
     }
 
     fn truth_at(&self, t_s: f64) -> Option<f64> {
+        self.truth_within(t_s, 0.1)
+    }
+
+    /// The truth where no more than `gap_s` is between what is known before and after.
+    fn truth_within(&self, t_s: f64, gap_s: f64) -> Option<f64> {
         let index = self.truth.partition_point(|row| row.0 < t_s);
         let (before, after) = (self.truth.get(index.checked_sub(1)?)?, self.truth.get(index)?);
         let share = (t_s - before.0) / (after.0 - before.0);
-        (after.0 - before.0 < 0.1).then_some(before.1 + share * (after.1 - before.1))
+        (after.0 - before.0 < gap_s).then_some(before.1 + share * (after.1 - before.1))
     }
 }
 
@@ -275,17 +280,17 @@ fn shared_data() -> PathBuf {
     std::env::var_os("HOLOD_SHARED_DATA").map_or_else(default, PathBuf::from)
 }
 
-/// One eye of a real recording, in millimetres; the median of a tenth of a second around each sample stands for the
-/// truth, away from blinks. Areas in arbitrary units are made diameters of 4 mm in the median.
-fn recorded(file: &str, eye: SampleEye, area: bool) -> Trace {
+/// A real recording of both eyes, in millimetres. Diameters without a unit are made 4 mm in the median.
+struct Recorded {
+    samples: Vec<PupilSample>,
+    eyes: [Trace; 2],
+}
+
+/// The median of a tenth of a second around each sample stands for the truth, away from blinks. A blink is of both
+/// eyes, even where only one of them was lost.
+fn recorded(file: &str, without_unit: bool) -> Recorded {
     let recording = Recording::read(&shared_data().join("pupil").join(file)).expect("reads");
-    let mut samples: Vec<_> = recording.samples().filter(|sample| sample.eye == eye).collect();
-    if area {
-        let mut areas: Vec<_> = samples.iter().map(|sample| sample.diameter_mm).filter(|area| *area > 0.0).collect();
-        areas.sort_by(f32::total_cmp);
-        let middle = areas[areas.len() / 2];
-        samples.iter_mut().for_each(|sample| sample.diameter_mm = 4.0 * (sample.diameter_mm / middle).sqrt());
-    }
+    let mut samples: Vec<_> = recording.samples().collect();
     let guard = TimeNs(250_000_000);
     let seen = |sample: &PupilSample| sample.valid && sample.diameter_mm > 1.0 && sample.confidence > 0.6;
     let lost: Vec<_> = samples.iter().filter(|sample| !seen(sample)).map(|sample| sample.t_sample).collect();
@@ -294,29 +299,151 @@ fn recorded(file: &str, eye: SampleEye, area: bool) -> Trace {
         lost.get(first_lost).is_none_or(|lost| *lost > t + guard)
             && recording.blinks().iter().all(|blink| t < blink.begins - guard || t > blink.ends + guard)
     };
-    let half = TimeNs(50_000_000);
-    let truth = samples.iter().enumerate().filter(|(_, sample)| open(sample.t_sample)).map(|(index, sample)| {
-        let t = sample.t_sample;
-        let before = samples[..index].iter().rev().take_while(|other| t - other.t_sample < half);
-        let after = samples[index..].iter().take_while(|other| other.t_sample - t < half);
-        let mut near: Vec<_> = before.chain(after).map(|other| f64::from(other.diameter_mm)).collect();
-        near.sort_by(f64::total_cmp);
-        (t.seconds(), near[near.len() / 2])
+    let eyes = [SampleEye::Left, SampleEye::Right].map(|eye| {
+        let mut of_eye: Vec<_> = samples.iter_mut().filter(|sample| sample.eye == eye).collect();
+        if without_unit {
+            let mut sorted: Vec<_> = of_eye.iter().filter(|sample| seen(sample)).map(|s| s.diameter_mm).collect();
+            sorted.sort_by(f32::total_cmp);
+            let middle = sorted[sorted.len() / 2];
+            of_eye.iter_mut().for_each(|sample| sample.diameter_mm *= 4.0 / middle);
+        }
+        let of_eye: Vec<_> = of_eye.into_iter().map(|sample| *sample).collect();
+        let half = TimeNs(50_000_000);
+        let truth = of_eye.iter().enumerate().filter(|(_, sample)| open(sample.t_sample)).map(|(index, sample)| {
+            let t = sample.t_sample;
+            let before = of_eye[..index].iter().rev().take_while(|other| t - other.t_sample < half);
+            let after = of_eye[index..].iter().take_while(|other| other.t_sample - t < half);
+            let mut near: Vec<_> = before.chain(after).map(|other| f64::from(other.diameter_mm)).collect();
+            near.sort_by(f64::total_cmp);
+            (t.seconds(), near[near.len() / 2])
+        });
+        Trace { truth: truth.collect(), samples: of_eye.clone() }
     });
-    Trace { truth: truth.collect(), samples: samples.clone() }
+    Recorded { samples, eyes }
 }
 
 const EYELINK: &str = "eyelink_500hz/002_rlmw_samples_short.asc";
 
+fn recordings() -> [(&'static str, Recorded); 3] {
+    [
+        ("Neon", recorded("neon_demo/3d_eye_states.csv", false)),
+        ("Core", recorded("core_music/pupil_positions.csv", false)),
+        ("EyeLink", recorded(EYELINK, true)),
+    ]
+}
+
 fn recorded_eyes() -> Vec<(String, Trace)> {
-    let files = [
-        ("Neon", "neon_demo/3d_eye_states.csv", false),
-        ("Core", "core_music/pupil_positions.csv", false),
-        ("EyeLink", EYELINK, true),
-    ];
-    let eyes = [SampleEye::Left, SampleEye::Right];
-    let of_file = |(name, file, area)| eyes.map(|eye| (format!("{name} {eye:?}"), recorded(file, eye, area)));
-    files.into_iter().flat_map(of_file).collect()
+    let eyes = recordings().into_iter().flat_map(|(name, recorded)| {
+        let [left, right] = recorded.eyes;
+        [(format!("{name} Left"), left), (format!("{name} Right"), right)]
+    });
+    eyes.collect()
+}
+
+/// Longer than a blink with the guards around it.
+const BLINK_S: f64 = 1.5;
+
+/// What was shown of a recording 20 ms after each sample, in whatever state, less the mean of the eyes that are asked
+/// for: away from blinks, and from before a blink to after it, where a straight line stands for the truth.
+fn errors_mm(recorded: &Recorded, eye: rig::Eye, shown: &[(f64, f64)]) -> [Vec<f64>; 2] {
+    let [left, right] = &recorded.eyes;
+    let (mut away, mut through) = (Vec::new(), Vec::new());
+    for (t_s, mm) in shown {
+        let truth_within = |gap_s| match eye {
+            rig::Eye::Left => left.truth_within(*t_s, gap_s),
+            rig::Eye::Right => right.truth_within(*t_s, gap_s),
+            _ => Some(0.5 * (left.truth_within(*t_s, gap_s)? + right.truth_within(*t_s, gap_s)?)),
+        };
+        if let Some(truth_mm) = truth_within(0.1) {
+            away.push(mm - truth_mm);
+        } else if let Some(truth_mm) = truth_within(BLINK_S) {
+            through.push(mm - truth_mm);
+        }
+    }
+    [away, through]
+}
+
+fn shown_throughout(samples: &[PupilSample], eye: rig::Eye) -> Vec<(f64, f64)> {
+    let mut estimator = Estimator::new(settings(eye));
+    let begins = samples[0].t_sample + TimeNs(1_000_000_000);
+    let mut shown = Vec::new();
+    for sample in samples {
+        estimator.push(*sample, |_| {});
+        let t = sample.t_sample + TimeNs(20_000_000);
+        if t > begins {
+            shown.push((t.seconds(), f64::from(estimator.pupil_at(t).pupil.mm())));
+        }
+    }
+    shown
+}
+
+const EYES: [rig::Eye; 4] = [rig::Eye::Left, rig::Eye::Right, rig::Eye::Both, rig::Eye::Better];
+
+/// How far the pupil that is shown falls below the narrower of the two eyes.
+fn deepest_fall_mm(recorded: &Recorded, shown: &[(f64, f64)]) -> f64 {
+    let falls = shown.iter().filter_map(|(t_s, mm)| {
+        let [left, right] = recorded.eyes.each_ref().map(|eye| eye.truth_within(*t_s, BLINK_S));
+        Some(left?.min(right?) - mm)
+    });
+    falls.fold(0.0, f64::max)
+}
+
+#[test]
+#[ignore = "needs shared data"]
+fn shared_data_no_blink_of_a_real_eye_takes_the_pupil_down() {
+    let recorded = recorded(EYELINK, true);
+    for eye in EYES {
+        let shown = shown_throughout(&recorded.samples, eye);
+        // The right eye falls by 0.24 mm at 40.4 s, no faster than in a reflex.
+        let fall_mm = deepest_fall_mm(&recorded, &shown);
+        assert!(fall_mm < 0.5, "{eye:?}: {fall_mm}");
+        let [away, _] = errors_mm(&recorded, eye, &shown);
+        assert!(rms(away.iter().copied()) < 0.06, "{eye:?}: {}", rms(away.iter().copied()));
+    }
+}
+
+#[test]
+fn the_judge_of_blinks_knows_a_dip() {
+    let known = |t_s: &f64| !(2.0..2.4).contains(t_s);
+    let times = || (0..400).map(|k| f64::from(k) * 0.01);
+    let eye = |mm: f64| Trace { samples: Vec::new(), truth: times().filter(known).map(|t_s| (t_s, mm)).collect() };
+    let recorded = Recorded { samples: Vec::new(), eyes: [eye(4.0), eye(3.5)] };
+    let shown = |dip_s: f64, mm: f64| -> Vec<_> {
+        times().map(|t_s| (t_s, if (t_s - dip_s).abs() < 0.05 { mm } else { 4.0 })).collect()
+    };
+    for (dip_s, mm, fall_mm, away_mm, through_mm) in
+        [(2.2, 4.0, 0.0, 0.0, 0.0), (2.2, 2.9, 0.6, 0.0, 1.1), (2.2, 4.6, 0.0, 0.0, 0.6), (3.0, 2.9, 0.6, 1.1, 0.0)]
+    {
+        let shown = shown(dip_s, mm);
+        assert!((deepest_fall_mm(&recorded, &shown) - fall_mm).abs() < 1e-9, "{mm} at {dip_s}");
+        let worst =
+            errors_mm(&recorded, rig::Eye::Left, &shown).map(|mm| mm.into_iter().fold(0.0, |w, e| e.abs().max(w)));
+        assert!(
+            (worst[0] - away_mm).abs() < 1e-9 && (worst[1] - through_mm).abs() < 1e-9,
+            "{mm} at {dip_s}: {worst:?}"
+        );
+    }
+}
+
+#[test]
+#[ignore = "needs shared data"]
+fn shared_data_print_the_blinks() {
+    let of = |mut errors_mm: Vec<f64>| {
+        let rms = rms(errors_mm.iter().copied());
+        errors_mm.iter_mut().for_each(|error| *error = error.abs());
+        errors_mm.sort_by(f64::total_cmp);
+        let quantiles = [0.5, 0.9, 0.99, 1.0].map(|q| errors_mm[((errors_mm.len() - 1) as f64 * q) as usize]);
+        [[rms].as_slice(), &quantiles].concat().iter().map(|mm| format!("{mm:.3}")).collect::<Vec<_>>().join(" | ")
+    };
+    eprintln!("| Recording, eye | away rms | p50 | p90 | p99 | worst | through rms | p50 | p90 | p99 | worst | fall |");
+    eprintln!("|---|---|---|---|---|---|---|---|---|---|---|---|");
+    for (name, recorded) in recordings() {
+        for eye in EYES {
+            let shown = shown_throughout(&recorded.samples, eye);
+            let [away, through] = errors_mm(&recorded, eye, &shown).map(of);
+            eprintln!("| {name} {eye:?} | {away} | {through} | {:.2} |", deepest_fall_mm(&recorded, &shown));
+        }
+    }
 }
 
 fn row(name: &str, trace: &Trace, still: Option<&Trace>, kind: &Kind) {

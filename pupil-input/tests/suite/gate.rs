@@ -4,8 +4,8 @@
 use crate::support::settings;
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{
-    Decision, Estimator, EstimatorSettings, GateSettings, MockSource, PupilSample, PupilState, Rejection, SampleEye,
-    Scenario, Script, Verdict,
+    Decision, Estimator, EstimatorSettings, GateSettings, MockSample, MockSource, PupilSample, PupilState, Rejection,
+    SampleEye, Scenario, Script, Verdict,
 };
 
 /// What a viewer would have been shown, from the second second on.
@@ -30,6 +30,10 @@ impl Shown {
 
 /// Plays a script and asks for the pupil now and up to 40 ms ahead at each sample of the left eye (or of the pair).
 fn shown(script: Script, settings: EstimatorSettings) -> Shown {
+    shown_of(MockSource::of(script), settings)
+}
+
+fn shown_of(samples: impl Iterator<Item = MockSample>, settings: EstimatorSettings) -> Shown {
     let mut estimator = Estimator::new(settings);
     let mut shown = Shown {
         worst_tracking_mm: 0.0,
@@ -40,7 +44,7 @@ fn shown(script: Script, settings: EstimatorSettings) -> Shown {
         spoilt: 0,
     };
     let (mut tracking, mut asked) = (0, 0);
-    for mock in MockSource::of(script) {
+    for mock in samples {
         let PupilSample { t_sample, eye, diameter_mm, .. } = mock.sample;
         estimator.push(mock.sample, |Decision { verdict, .. }| {
             if let Verdict::Rejected(reason) = verdict {
@@ -95,6 +99,60 @@ fn blinks_of_zeros_never_leak() {
     }
 }
 
+/// Every two seconds a lid covers `depth_mm` of the pupil, comes at `mm_per_s`, stays for 80 ms and goes at `mm_per_s`;
+/// the tracker says nothing of it.
+fn lidded(text: &str, mm_per_s: f64, depth_mm: f64) -> impl Iterator<Item = MockSample> {
+    MockSource::of(script(text)).map(move |mut mock| {
+        let since_s = (mock.sample.t_sample.seconds() - 1.5).rem_euclid(2.0);
+        let comes_s = depth_mm / mm_per_s;
+        let covered = (since_s / comes_s).min((2.0 * comes_s + 0.08 - since_s) / comes_s).clamp(0.0, 1.0);
+        mock.sample.diameter_mm -= (covered * depth_mm) as f32;
+        mock
+    })
+}
+
+const QUIET: &str = "rate 500\nnoise 0.008mm\nconfidence none\neyes L\n0s pupil 4mm";
+
+#[test]
+fn a_slow_lid_of_which_nobody_tells_is_not_followed() {
+    for (mm_per_s, depth_mm) in [(12.0, 0.5), (12.0, 1.0), (16.0, 0.5), (16.0, 1.0), (16.0, 1.5)] {
+        let shown = shown_of(lidded(QUIET, mm_per_s, depth_mm), settings(rig::Eye::Left));
+        let worst_mm = shown.worst_tracking_mm.max(shown.worst_holding_mm);
+        // A part of its way is within what noise explains, and is run on for the wait and the time ahead.
+        assert!(worst_mm < 0.6, "{mm_per_s} mm/s, {depth_mm} mm: {worst_mm}");
+        assert!(shown.tracking > 0.8, "{mm_per_s} mm/s, {depth_mm} mm: {}", shown.tracking);
+    }
+}
+
+/// What lies in the noise of one sample is followed for a while, and run on where the eye is lost then.
+#[test]
+fn samples_of_the_pupil_are_believed_again_soon_after_a_lid_was_followed() {
+    let noisy = "rate 1000\nnoise 0.02mm\nconfidence none\neyes L\n0s pupil 4mm";
+    for (text, mm_per_s) in [(QUIET, 25.0), (noisy, 16.0), (noisy, 25.0)] {
+        let shown = shown_of(lidded(text, mm_per_s, 0.5), settings(rig::Eye::Left));
+        // Nineteen dips in 39 s, of 0.1 s each, with guards of 0.08 s.
+        assert!(shown.tracking > 0.88, "{mm_per_s} mm/s: {}", shown.tracking);
+        let worst_mm = shown.worst_tracking_mm.max(shown.worst_holding_mm);
+        assert!(worst_mm < 1.1, "{mm_per_s} mm/s: {worst_mm}");
+    }
+}
+
+#[test]
+fn a_reflex_is_followed_as_soon_as_before_its_blink_and_after_it() {
+    let reflex = "0s light 1cd\n2.5s every 8s light 1000cd\n6.5s every 8s light 1cd";
+    for rate in ["rate 200\nnoise 0.05mm", "rate 500\nnoise 0.008mm", "rate 1000\nnoise 0.02mm"] {
+        let text = format!("{rate}\nconfidence none\neyes L\n{reflex}");
+        let alone = shown(script(&text), settings(rig::Eye::Left));
+        assert_eq!((alone.holding, alone.of(Rejection::Slew)), (0, 0), "{rate}");
+        assert!(alone.worst_tracking_mm < 0.4, "{rate}: {}", alone.worst_tracking_mm);
+        // The constriction begins at 2.68 s; the blink is in the midst of it.
+        let blinks = shown(script(&format!("{text}\n2.9s every 8s blink 150ms")), settings(rig::Eye::Left));
+        assert!(blinks.of(Rejection::OutOfReach) + blinks.of(Rejection::Slew) > 20, "{rate}: the blinks are there");
+        assert!(blinks.tracking > 0.93, "{rate}: {}", blinks.tracking);
+        assert!(blinks.worst_holding_mm < 0.8 && blinks.worst_tracking_mm < 0.8, "{rate}: {}", blinks.worst_holding_mm);
+    }
+}
+
 #[test]
 fn the_judge_sees_a_gate_that_lets_all_pass() {
     let mut open = settings(rig::Eye::Left);
@@ -110,6 +168,8 @@ fn the_judge_sees_a_gate_that_lets_all_pass() {
         let shown = shown(script(text), open);
         assert!(shown.worst_tracking_mm.max(shown.worst_holding_mm) > 0.6, "{text}: {}", shown.worst_tracking_mm);
     }
+    let shown = shown_of(lidded(QUIET, 12.0, 1.0), open);
+    assert!(shown.worst_tracking_mm > 0.9, "{}", shown.worst_tracking_mm);
 }
 
 #[test]

@@ -14,6 +14,7 @@ const MOST_SAMPLES: usize = 120_000;
 /// One decision, as plots need it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Mark {
+    t_device: TimeNs,
     pub(super) t_sample: TimeNs,
     pub(super) t_arrival: TimeNs,
     pub(super) raw_mm: f32,
@@ -57,7 +58,7 @@ pub(super) struct EyeFigures {
     pub(super) accepted: u64,
     /// Of those that it did not: how many for which reason.
     pub(super) rejected: BTreeMap<&'static str, u64>,
-    /// Samples a second while they come, over those of the last minute.
+    /// Samples a second while they come, over those of the last minute: by the tracker's own clock where it has one.
     pub(super) rate_hz: Option<f64>,
     /// Time between neighbouring samples as the tracker took them.
     pub(super) interval_ms: Option<Quantiles>,
@@ -81,6 +82,7 @@ impl ObservedEye {
             Verdict::Rejected(reason) => *self.rejected.entry(reason.name()).or_default() += 1,
         }
         let mark = Mark {
+            t_device: sample.t_device,
             t_sample: sample.t_sample,
             t_arrival: sample.t_arrival,
             raw_mm: sample.diameter_mm,
@@ -105,20 +107,24 @@ impl ObservedEye {
         };
         let seen = || self.marks.iter().filter(|mark| mark.valid && mark.raw_mm.is_finite());
         let believed = || seen().filter(|mark| mark.verdict == Verdict::Accepted);
-        let interval_ms = differences(|mark| mark.t_sample);
+        // Without times of its own, a first read's samples are stamped before the tracker's interval is known.
+        let first_read = self.marks.front().map(|mark| mark.t_arrival);
+        let timed =
+            self.marks.iter().filter(|mark| mark.t_device != mark.t_sample || Some(mark.t_arrival) != first_read);
+        let times: Vec<_> = timed.map(|mark| mark.t_device).collect();
+        let steps_ms: Vec<_> = times.windows(2).map(|pair| (pair[1] - pair[0]).seconds() * 1e3).collect();
         // Losses and silences are no part of the rate: the mean of the intervals that are not much longer than usual.
-        let usual_ms = interval_ms.map_or(0.0, |interval| interval.median);
-        let times = self.marks.iter().map(|mark| mark.t_sample);
-        let steps = times.clone().zip(times.skip(1)).map(|(t, next)| (next - t).seconds() * 1e3);
-        let (count, sum_ms) = steps
-            .filter(|step| *step <= 1.5 * usual_ms)
+        let usual_ms = Quantiles::of(steps_ms.clone()).map_or(0.0, |interval| interval.median);
+        let (count, sum_ms) = steps_ms
+            .iter()
+            .filter(|step| (0.0..=1.5 * usual_ms).contains(*step))
             .fold((0_u32, 0.0), |(count, sum), step| (count + 1, sum + step));
         EyeFigures {
             samples: self.samples,
             accepted: self.accepted,
             rejected: self.rejected.clone(),
             rate_hz: (sum_ms > 0.0).then(|| 1e3 * f64::from(count) / sum_ms),
-            interval_ms,
+            interval_ms: differences(|mark| mark.t_sample),
             arrival_interval_ms: differences(|mark| mark.t_arrival),
             delay_ms: Quantiles::of(
                 self.marks.iter().map(|mark| (mark.t_arrival - mark.t_sample).seconds() * 1e3).collect(),
@@ -194,6 +200,25 @@ mod tests {
         assert!((figures.delay_ms.unwrap().max - 3.0).abs() < 1e-9);
         assert!((figures.raw_mm.unwrap().p1 - 4.0).abs() < 1e-9, "what the tracker calls lost is no diameter");
         assert_eq!(observed.figures().len(), 1);
+    }
+
+    /// 500 Hz for 6 s; the first nine samples come in one read and are mapped too near to each other.
+    #[test]
+    fn the_rate_is_the_trackers_whatever_came_in_the_first_read() {
+        for own_times in [true, false] {
+            let mut observed = Observed::default();
+            for k in 0..3000 {
+                let mut decision = decision(0, 0, 4.0, Verdict::Accepted);
+                let t = TimeNs(2_000_000 * k);
+                decision.sample.t_arrival = t.max(TimeNs(16_000_000));
+                decision.sample.t_sample = if k < 9 { TimeNs(16_000_000 - 1_000_000 * (8 - k)) } else { t };
+                let t_device = if own_times { t + TimeNs(77_000_000_000) } else { decision.sample.t_sample };
+                decision.sample.t_device = t_device;
+                observed.take(&decision);
+            }
+            let rate_hz = observed.figures()["left"].rate_hz.unwrap();
+            assert!((rate_hz - 500.0).abs() < 1e-6, "{own_times}: {rate_hz}");
+        }
     }
 
     #[test]
