@@ -35,6 +35,8 @@ def across_benches(
     networks = {path.stem: load_weights(path).to(device) for path in weights}
     if len(networks) < len(weights):
         raise ShardError("weights: found two files of one name; give each a name of its own")
+    if len({folder.name for folder in folders}) < len(folders):
+        raise ShardError("--test: found two folders of one name, which is their bench's; give each a name of its own")
     # All folders are looked at before the long work.
     benches = [(folder.name, open_alike(folder, limit)) for folder in folders]
     for _, shards in benches:

@@ -83,6 +83,17 @@ def test_a_folder_without_scenes_is_said_before_the_long_work(tmp_path: Path) ->
     assert not (tmp_path / "out").exists()
 
 
+def test_two_benches_of_one_name_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_weights(tmp_path / "one.safetensors", build_network(TINY), {}, {})
+    command = ["across-benches", "--weights", str(tmp_path / "one.safetensors"), "--out", str(tmp_path / "out")]
+    for bench, metadata in (("default", {}), ("gaea", GAEA)):
+        write_shard(tmp_path / bench / "test" / "scene_000000.safetensors", metadata=metadata)
+        command += ["--test", str(tmp_path / bench / "test")]
+    assert main([*command, "--border-px", "8"]) == 65
+    assert "--test: found two folders of one name" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_borders_and_limits_that_leave_nothing_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_weights(tmp_path / "one.safetensors", build_network(TINY), {}, {})
     write_shard(tmp_path / "test" / "scene_000000.safetensors")
