@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from holod_training.config import OpticsConfig
-from holod_training.export import check_folder, load_weights, write_beside
+from holod_training.export import check_folder, load_weights, weights_sha256, write_beside
 from holod_training.judging import AFTER, OURS, Bench, Judged, judge_scenes, network_method, open_alike, rivals
 from holod_training.metrics import SSIM_WINDOW_PX
 from holod_training.network import FieldNetwork
@@ -47,6 +47,14 @@ def across_benches(
     }
     result = {
         "border_px": border_px,
+        "networks": [
+            {
+                "method": name,
+                "weights_sha256": weights_sha256(network),
+                "amplitude_constant": network.config.amplitude_constant,
+            }
+            for name, network in networks.items()
+        ],
         "benches": [
             {**_bench(name, shards, judged[name]), "outside_training": _outside(networks, shards[0].optics)}
             for name, shards in benches

@@ -158,7 +158,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.add_argument("--out", required=True)
     export.add_argument("--force", action="store_true", help=FORCE_HELP)
-    export.add_argument("--amplitude-constant", type=float, help="double phase's K; the source's own where left out")
+    export.add_argument(
+        "--amplitude-constant",
+        type=float,
+        help="double phase's K; the source's own where left out, whose figures another one leaves out",
+    )
     export.add_argument("--evaluation", help="evaluation.json whose numbers the file is to carry")
     export.add_argument("--evaluation-method", default="holod", help="whose rows of it: another file named by --also")
     export.add_argument("--benches", help="benches.json of across-benches, whose numbers the file is to carry")

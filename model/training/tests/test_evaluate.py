@@ -504,6 +504,27 @@ def test_export_stamps_the_constant_and_the_evaluation(
     assert "matrix_psnr_db" not in read_metadata(out)["metrics"]
 
 
+def test_figures_stay_with_their_amplitude_constant(evaluation: Path, tmp_path: Path) -> None:
+    source, out = tmp_path / "source.safetensors", tmp_path / "out.safetensors"
+    network = load_weights(evaluation / "w.safetensors")
+    save_weights(source, network, {"rows": [1]}, {})
+    for constant, expected in (("1.4", {"rows": [1]}), ("4", {})):
+        assert (
+            main(["export", "--source", str(source), "--out", str(out), "--amplitude-constant", constant, "--force"])
+            == 0
+        )
+        assert read_metadata(out)["metrics"] == expected
+
+
+def test_what_is_no_evaluation_is_told_without_a_traceback(
+    evaluation: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--source", str(evaluation / "w.safetensors"), "--out", str(tmp_path / "x.safetensors")]
+    for option, told in (("--evaluation", "not an evaluation"), ("--benches", "not a table across benches")):
+        assert main(["export", *arguments, option, str(evaluation / "out" / "scenes.json")]) == 65
+        assert f"scenes.json: {told}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "told"),
     [
