@@ -399,6 +399,24 @@ def test_options_change_the_variant_that_they_name() -> None:
         benches("--volume-blur-px", "20")
 
 
+def test_what_initial_weights_are_for_stays_unless_options_name_it(tmp_path: Path) -> None:
+    network = dataclasses.replace(TINY, trained=TrainedRange((10.0, 90.0), (20.0, 50.0)), amplitude_constant=1.25)
+    start = tmp_path / "start.safetensors"
+    save_weights(start, build_network(network), {}, {})
+
+    def going_on(*more: str) -> NetworkConfig:
+        common = ["--shards", "a", "--out", "b", "--steps", "1", "--initial-weights", str(start)]
+        options = cli._parser().parse_args(["train", *common, *more])
+        return cli._train_config(options, network=cli._network(options)).network
+
+    assert (going_on().trained, going_on().amplitude_constant) == (network.trained, 1.25)
+    assert going_on("--volume-blur-px", "5,115").trained == TrainedRange((5.0, 115.0), (20.0, 50.0))
+    assert going_on("--benches", "any").trained == ANY_BENCH
+    assert going_on("--double-phase", "1.1").amplitude_constant == 1.1
+    with pytest.raises(WeightsError, match="not a readable weights file"):
+        going_on("--initial-weights", str(tmp_path / "none.safetensors"))
+
+
 def test_each_step_has_a_bench_of_its_own(shards: Path, tmp_path: Path) -> None:
     """The network makes its field for the bench that the crop was drawn for."""
     network = dataclasses.replace(TINY, trained=ANY_BENCH)
