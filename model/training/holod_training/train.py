@@ -573,6 +573,7 @@ def _train(
         mininterval=1 if sys.stderr.isatty() else 60,
     )
     window: list[dict[str, float]] = []
+    saved: int | None = None
     began = time.monotonic() - run.seconds
     while run.step < config.steps:
         window.append(run.train_step())
@@ -591,11 +592,15 @@ def _train(
             # Every rank meets here, so that none runs ahead of the files.
             if rank == 0:
                 run.save_checkpoint()
+            saved = run.step
             if world > 1:
                 dist.barrier()
         if log and (run.step % config.validate_every == 0 or done):
             _validate(run, log, weights)
         if interrupt.came:
+            if saved != run.step:
+                # It came while this step was validated.
+                run.save_checkpoint()
             left = (
                 f"{weights} is of the last step" if done else f"{checkpoint} is of step {run.step}: go on with --resume"
             )

@@ -22,7 +22,7 @@ from holod_training.benches import ANY_BENCH, BenchDraw
 from holod_training.cli import main
 from holod_training.compare import compare
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig, TrainedRange
-from holod_training.export import WeightsError, export, load_weights, read_metadata, save_weights
+from holod_training.export import WeightsError, export, load_weights, read_checkpoint, read_metadata, save_weights
 from holod_training.loss import LossWeights, focus_loss
 from holod_training.network import DirectNetwork
 from holod_training.optics import HalfBandEye
@@ -849,6 +849,26 @@ def test_an_interrupt_leaves_a_checkpoint_and_no_traceback(
     assert main([*command, str(tmp_path / "cut"), "--resume"]) == 0
     whole, cut = (load_file(tmp_path / name / "weights.safetensors") for name in ("whole", "cut"))
     assert all(torch.equal(value, cut[name]) for name, value in whole.items())
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_an_interrupt_while_a_step_is_validated_leaves_its_checkpoint(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    validate = Run.validate
+
+    def interrupted(self: Run) -> dict[str, dict[str, float]]:
+        signal.raise_signal(signal.SIGINT)
+        return validate(self)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        monkeypatch.setattr(Run, "validate", interrupted)
+        with pytest.raises(KeyboardInterrupt, match=r"checkpoint\.pt is of step 2: go on with --resume"):
+            train(tiny(shards, tmp_path / "run", validate_every=2), CPU)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert read_checkpoint(tmp_path / "run" / "checkpoint.pt")["step"] == 2
 
 
 def test_an_out_that_is_no_folder_is_refused_before_the_work(
