@@ -38,7 +38,7 @@ from holod_training.rivals import (
     smooth_phase,
     transport_of_intensity,
 )
-from holod_training.shards import Shard, Stack
+from holod_training.shards import Shard, ShardError, Stack
 from holod_training.solver import Solution, optimise
 from holod_training.variants import build_network, variant
 
@@ -49,7 +49,7 @@ OPTICS = OpticsConfig()
 
 
 def write_card(path: Path, seed: int, metadata: dict[str, str] | None = None) -> None:
-    write_shard(path, seed=seed, size=128, pupils_mm=(1.0, 2.0), metadata=metadata)
+    write_shard(path, seed=seed, size=128, pupils_mm=(1.0, 2.0), metadata={"kind": "cards", **(metadata or {})})
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()
     tensors = load_file(path)
@@ -382,6 +382,28 @@ def test_cards_and_marks_must_be_alike(
     assert main(["evaluate", *arguments, option, str(tmp_path / "odd"), "--out", str(tmp_path / "out")]) == 65
     assert re.search(rf"scene_000001\.safetensors: {message}", capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_that_is_there_twice_is_refused(evaluation: Path, tmp_path: Path, capsys) -> None:
+    for name in ("scene_000000", "scene_000007"):
+        write_shard(tmp_path / "test" / f"{name}.safetensors", seed=3, pupils_mm=PUPILS)
+        write_card(tmp_path / "cards" / f"{name}.safetensors", seed=3)
+    command = ["evaluate", "--weights", str(evaluation / "w.safetensors"), "--out", str(tmp_path / "out"), "--test"]
+    for options in (
+        [str(tmp_path / "test")],
+        [str(evaluation / "test"), "--cards", str(tmp_path / "cards")],
+    ):
+        assert main([*command, *options]) == 65
+        error = capsys.readouterr().err
+        assert re.search(r"scene_000007\.safetensors: found number 3 of seed 3, as in .*scene_000000", error)
+    assert not (tmp_path / "out").exists()
+
+
+def test_scenes_of_another_kind_are_no_cards(tmp_path: Path) -> None:
+    write_card(tmp_path / "scene_000000.safetensors", seed=0, metadata={"kind": "marks"})
+    shards = [Shard(tmp_path / "scene_000000.safetensors")]
+    with pytest.raises(ShardError, match="kind 'marks', expected cards"):
+        refocus_cards(shards, rivals(OPTICS)[:1], Bench(OPTICS, 1.25, 8), tmp_path / "sheet.png")
 
 
 def test_judged_between_what_methods_know(tmp_path: Path, evaluation: Path, capsys, monkeypatch) -> None:
