@@ -433,6 +433,7 @@ class Run:
             "format": "holod-checkpoint-1",
             "step": self.step,
             "seconds": self.seconds,
+            "processes": self.world,
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -454,6 +455,13 @@ class Run:
             raise TrainingError(
                 f"{self.config.out}: {'; '.join(other)}; resume with the options that config.json there has, or go on "
                 "with others in a folder of its own by --initial-weights"
+            )
+        # Older checkpoints do not say of how many.
+        if (processes := state.get("processes", self.world)) != self.world:
+            raise TrainingError(
+                f"{self.config.out}: found a checkpoint of {processes} process(es), expected {self.world}: each adds "
+                f"crops to every step; resume with `torchrun --nproc-per-node={processes}`, or go on in a folder of its "
+                "own by --initial-weights"
             )
         try:
             self.network.load_state_dict(state["network"])

@@ -186,7 +186,11 @@ def test_other_options_than_the_checkpoints_are_refused_by_name(shards: Path, tm
             resume(**changes)
     elsewhere = {"out": str(tmp_path / "moved"), "initial_weights": None, "validation": None}
     assert resume(steps=9, validate_every=1, learning_rate=1e-3, precision="bf16", **elsewhere) == 1
+    state["processes"] = 2
+    with pytest.raises(TrainingError, match=r"found a checkpoint of 2 process\(es\), expected 1: .* with `torchrun"):
+        resume()
     # An older checkpoint lacks what is as it was.
+    del state["processes"]
     stored = json.loads(state["config"])
     del stored["double_phase"], stored["loss"]["foam"], stored["network"]["feedback"]
     state["config"] = json.dumps(stored)
