@@ -509,7 +509,7 @@ def test_scenes_of_another_bench_are_refused(shards: Path, tmp_path: Path) -> No
         (shards / f"scene_{index:06}.safetensors").unlink()
     with pytest.raises(TrainingError, match=r"diffraction is 147\.\d to 208\.\d px2, expected 32 to 46"):
         Run(tiny(shards, tmp_path / "other", batch=4, validation=None), CPU).train_step()
-    network = dataclasses.replace(TINY, trained=ANY_BENCH)
+    network = dataclasses.replace(TINY, trained=TrainedRange((5.0, 125.0), ANY_BENCH.volume_fresnel_px2))
     assert Run(tiny(shards, tmp_path / "told", batch=4, network=network, validation=None), CPU).train_step()["loss"] > 0
 
 
@@ -523,6 +523,26 @@ def test_validation_scenes_of_another_bench_are_refused_before_the_first_step(sh
             Run(tiny(shards, tmp_path / "run", network=gaea, benches=benches), CPU)
     any_bench = dataclasses.replace(TINY, trained=ANY_BENCH)
     Run(tiny(shards, tmp_path / "run", network=any_bench, benches=BenchDraw()), CPU)
+
+
+def test_scenes_of_pupils_that_the_network_is_not_told_are_refused(tmp_path: Path) -> None:
+    for index, pupils_mm in enumerate(((0.4, 2.0), (3.0, 7.99))):
+        write_shard(tmp_path / "s" / f"scene_{index:06}.safetensors", seed=index, pupils_mm=pupils_mm)
+    config = tiny(tmp_path / "s", tmp_path / "run", validation=None)
+    told = (
+        r"s: found scenes whose pupils blur by 5\.7 to 114\.1 px .*, expected 14 to 72 px, .*`--volume-blur-px 5,115`"
+    )
+    with pytest.raises(TrainingError, match=told):
+        train(config, CPU)
+    assert not (tmp_path / "run").exists()
+    run = Run(config, CPU)
+    run.step = 1
+    run.sampler.rescan()
+    run.train_step()
+    wide = dataclasses.replace(TINY, trained=TrainedRange((5.0, 115.0)))
+    Run(dataclasses.replace(config, network=wide), CPU).train_step()
+    specialists = dataclasses.replace(TINY, specialists_mm=(2.0, 3.0))
+    Run(dataclasses.replace(config, network=specialists), CPU).train_step()
 
 
 @pytest.mark.usefixtures("no_plots")
