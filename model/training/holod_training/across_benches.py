@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from holod_training.config import OpticsConfig
-from holod_training.export import check_folder, load_weights, write_beside
+from holod_training.export import check_folder, load_weights, weights_sha256, write_beside
 from holod_training.judging import AFTER, OURS, Bench, Judged, judge_scenes, network_method, open_alike, rivals
 from holod_training.metrics import SSIM_WINDOW_PX
 from holod_training.network import FieldNetwork
@@ -35,6 +35,8 @@ def across_benches(
     networks = {path.stem: load_weights(path).to(device) for path in weights}
     if len(networks) < len(weights):
         raise ShardError("weights: found two files of one name; give each a name of its own")
+    if len({folder.name for folder in folders}) < len(folders):
+        raise ShardError("--test: found two folders of one name, which is their bench's; give each a name of its own")
     # All folders are looked at before the long work.
     benches = [(folder.name, open_alike(folder, limit)) for folder in folders]
     for _, shards in benches:
@@ -45,6 +47,14 @@ def across_benches(
     }
     result = {
         "border_px": border_px,
+        "networks": [
+            {
+                "method": name,
+                "weights_sha256": weights_sha256(network),
+                "amplitude_constant": network.config.amplitude_constant,
+            }
+            for name, network in networks.items()
+        ],
         "benches": [
             {**_bench(name, shards, judged[name]), "outside_training": _outside(networks, shards[0].optics)}
             for name, shards in benches

@@ -21,8 +21,9 @@ ANY_BENCH = TrainedRange(volume_blur_px=(5.0, 115.0), volume_fresnel_px2=(8.0, 2
 class BenchDraw:
     """Random benches: each value uniform within its range, lengths and ratios by their logarithm.
 
-    The share `default` of benches is the default one, where it can show a scene's blur to a pupil of `pupil_mm`; of the
-    rest `at_infinity` have their far end there. Wavelengths are red's, green's and blue's of lasers that are sold.
+    The share `default` of benches is the default one, where it lies in what is `trained` and can show a scene's blur to
+    a pupil of `pupil_mm`; of the rest `at_infinity` have their far end there. Wavelengths are red's, green's and blue's
+    of lasers that are sold.
     """
 
     trained: TrainedRange = ANY_BENCH
@@ -40,7 +41,8 @@ class BenchDraw:
         bench of these ranges shows."""
         least_mm, most_mm = self.pupil_mm
         bench = OpticsConfig()
-        if rng.random() < self.default and least_mm <= bench.pupil_mm(volume_blur_px) <= most_mm:
+        shows = least_mm <= bench.pupil_mm(volume_blur_px) <= most_mm
+        if rng.random() < self.default and shows and self._trained(bench):
             return bench
         for _ in range(MOST_TRIALS):
             bench = self._any(rng)

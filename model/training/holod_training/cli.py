@@ -18,7 +18,7 @@ from holod_training.bench_engines import BenchError, Plan, bench_engines, markdo
 from holod_training.benches import ANY_BENCH, BenchDraw
 from holod_training.config import CONDITIONINGS, ConfigError, NetworkConfig, TrainedRange, require
 from holod_training.evaluate_config import EvaluateConfig
-from holod_training.export import WeightsError
+from holod_training.export import WeightsError, read_metadata
 from holod_training.goals import ReportError
 from holod_training.judging import LAYERED_ASM, OURS
 from holod_training.loss import LossWeights, option_of
@@ -88,7 +88,10 @@ def _parser() -> argparse.ArgumentParser:
     _training_options(training)
     training.add_argument("--steps", type=int, required=True)
     training.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
-    training.add_argument("--initial-weights", help="start from a weights file of the same variant")
+    training.add_argument(
+        "--initial-weights",
+        help="start from a weights file of the same variant, whose ranges and amplitude constant stay unless named",
+    )
     training.add_argument("--stop-below-slope", type=float, default=TrainConfig("", "", 1).stop_below_slope)
     _network_options(training)
     training.set_defaults(run=_train)
@@ -158,7 +161,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.add_argument("--out", required=True)
     export.add_argument("--force", action="store_true", help=FORCE_HELP)
-    export.add_argument("--amplitude-constant", type=float, help="double phase's K; the source's own where left out")
+    export.add_argument(
+        "--amplitude-constant",
+        type=float,
+        help="double phase's K; the source's own where left out, whose figures another one leaves out",
+    )
     export.add_argument("--evaluation", help="evaluation.json whose numbers the file is to carry")
     export.add_argument("--evaluation-method", default="holod", help="whose rows of it: another file named by --also")
     export.add_argument("--benches", help="benches.json of across-benches, whose numbers the file is to carry")
@@ -276,14 +283,15 @@ def _train_config(options: argparse.Namespace, **changes: Any) -> TrainConfig:
     augment = AugmentConfig(faulty_depth=options.faulty_depth)
     config = TrainConfig(**{**values, "loss": loss, "augment": augment, **changes})
     ranges = {f.name: getattr(options, f.name) for f in dataclasses.fields(TrainedRange)}
+    # What weights are for, and with which constant, stays with those that go on from them.
+    start = read_metadata(Path(config.initial_weights))["config"] if config.initial_weights else config.network
     trained = dataclasses.replace(
-        ANY_BENCH if options.benches == "any" else config.network.trained,
+        ANY_BENCH if options.benches == "any" else start.trained,
         **{key: value for key, value in ranges.items() if value is not None},
     )
     benches = BenchDraw(trained) if options.benches == "any" else None
-    network = dataclasses.replace(config.network, trained=trained)
-    if config.double_phase:
-        network = dataclasses.replace(network, amplitude_constant=config.double_phase)
+    constant = config.double_phase or start.amplitude_constant
+    network = dataclasses.replace(config.network, trained=trained, amplitude_constant=constant)
     return dataclasses.replace(config, benches=benches, network=network)
 
 

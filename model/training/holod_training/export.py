@@ -166,11 +166,14 @@ def export(
     if amplitude_constant is not None:
         if not 0 < amplitude_constant < math.inf:
             raise WeightsError(f"amplitude constant: found {amplitude_constant}, expected a number above 0")
+        if not math.isclose(amplitude_constant, network.config.amplitude_constant):
+            # Figures are of what a panel shows with the source's own constant.
+            metrics = {}
         network.config = dataclasses.replace(network.config, amplitude_constant=amplitude_constant)
     if evaluation:
         metrics = _summary(evaluation, method, network)
     if benches:
-        metrics = {**metrics, "benches": _of_benches(benches, benches_method or out.stem)}
+        metrics = {**metrics, "benches": _of_benches(benches, benches_method or out.stem, network)}
     save_weights(out, network, metrics, provenance)
     return out
 
@@ -214,45 +217,50 @@ def _summary(evaluation: Path, method: str, network: FieldNetwork) -> dict[str, 
         if not found["rows"]:
             there = ", ".join(sorted({row["method"] for row in result["rows"]}))
             raise WeightsError(f"{evaluation}: no method {method!r}; found {there}")
-        _require_judged(evaluation, result, method, network)
+        # Older evaluations judged all networks with the first one's constant.
+        usual = {"amplitude_constant": result["amplitude_constant"]}
+        _require_judged(evaluation, [{**usual, **row} for row in result["networks"]], method, network)
         return {**found, "matrix_psnr_db": result["matrix_psnr_db"]} if method == "holod" else found
-    except (OSError, json.JSONDecodeError, KeyError) as error:
+    except (OSError, json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise WeightsError(f"{evaluation}: not an evaluation ({error})") from error
 
 
-def _require_judged(evaluation: Path, result: dict[str, Any], method: str, network: FieldNetwork) -> None:
+def _require_judged(file: Path, networks: list[dict[str, Any]], method: str, network: FieldNetwork) -> None:
     """Raises WeightsError for figures that are not `network`'s. Older evaluations tell weights by their count alone."""
-    judged = {row["method"]: row for row in result["networks"]}
+    judged = {row["method"]: row for row in networks}
     if method not in judged:
-        raise WeightsError(f"{evaluation}: {method!r} is no network; expected one of {', '.join(judged)}")
+        raise WeightsError(f"{file}: {method!r} is no network; expected one of {', '.join(judged)}")
     expected = {"parameters": sum(p.numel() for p in network.parameters()), "weights_sha256": weights_sha256(network)}
     for key, value in expected.items():
         if judged[method].get(key, value) != value:
             raise WeightsError(
-                f"{evaluation}: {key} of {method!r}: found {judged[method][key]}, expected {value}, that of --source: "
-                "evaluate the weights that are exported"
+                f"{file}: {key} of {method!r}: found {judged[method][key]}, expected {value}, that of --source: "
+                "judge the weights that are exported"
             )
-    # Older evaluations judged all networks with the first one's.
-    found = judged[method].get("amplitude_constant", result["amplitude_constant"])
-    constant = network.config.amplitude_constant
+    found, constant = judged[method]["amplitude_constant"], network.config.amplitude_constant
     if not math.isclose(found, constant):
         raise WeightsError(
-            f"{evaluation}: amplitude_constant: found {found:g}, expected {constant:g}, that of the file to write: "
-            "evaluate what `export --amplitude-constant` writes, and export that again with --evaluation"
+            f"{file}: amplitude_constant: found {found:g}, expected {constant:g}, that of the file to write: "
+            "judge what `export --amplitude-constant` writes, and export that again with its figures"
         )
 
 
-def _of_benches(benches: Path, method: str) -> list[dict[str, Any]]:
-    """What `holod check` quotes: for each bench where it lies, and what the network reached there at each blur."""
+def _of_benches(benches: Path, method: str, network: FieldNetwork) -> list[dict[str, Any]]:
+    """What `holod check` quotes: for each bench where it lies, and what the network reached there at each blur. Raises
+    WeightsError where the figures are of another network or amplitude constant than `network`'s."""
     try:
-        found = json.loads(benches.read_text())["benches"]
+        table = json.loads(benches.read_text())
+        found = table["benches"]
+        # Older tables tell weights by their file's name alone, which others may have.
+        if "networks" not in table:
+            raise WeightsError(
+                f"{benches}: does not say of which weights its figures are; write it again with `across-benches`"
+            )
+        _require_judged(benches, table["networks"], method, network)
         result = []
         for bench in found:
-            gains = bench["gain_over_rival"].get(method)
+            gains = bench["gain_over_rival"][method]
             rows = [row for row in bench["rows"] if row["method"] == method]
-            if not (gains and rows):
-                there = ", ".join(sorted({row["method"] for row in bench["rows"]}))
-                raise WeightsError(f"{benches}: no method {method!r} on {bench['bench']}; found {there}")
             result.append(
                 {
                     "bench": bench["bench"],
@@ -270,5 +278,5 @@ def _of_benches(benches: Path, method: str) -> list[dict[str, Any]]:
                 }
             )
         return result
-    except (OSError, json.JSONDecodeError, KeyError) as error:
+    except (OSError, json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise WeightsError(f"{benches}: not a table across benches ({error})") from error

@@ -162,7 +162,7 @@ class Bench:
 
 
 def check_alike(shards: Sequence[Shard], in_what: Sequence[str], cure: str) -> None:
-    """Raises ShardError that names the first that is not as the first of all."""
+    """Raises ShardError that names the first that is not as the first of all, or that is one of the others."""
     for shard in shards[1:]:
         for what in in_what:
             found, expected = getattr(shard, what), getattr(shards[0], what)
@@ -171,6 +171,14 @@ def check_alike(shards: Sequence[Shard], in_what: Sequence[str], cure: str) -> N
                     f"{shard.path}: {what} is {found}, but {expected} in {shards[0].path.name}; "
                     f"evaluate scenes that are alike, each kind in its own folder, {cure}"
                 )
+    known: dict[tuple[str, str, int], Shard] = {}
+    for shard in shards:
+        same = known.setdefault((shard.kind, shard.seed, shard.index), shard)
+        if same is not shard:
+            raise ShardError(
+                f"{shard.path}: found number {shard.index} of seed {shard.seed}, as in {same.path}, expected each "
+                "scene once, for intervals take scenes for independent: delete one of the two"
+            )
 
 
 def open_alike(folder: Path, limit: int | None = None, between: bool = False) -> list[Shard]:

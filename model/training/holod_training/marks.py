@@ -9,7 +9,7 @@ from torch import Tensor
 
 from holod_training.judging import AFTER, BEFORE, OURS, Bench, Method, means
 from holod_training.loss import LEAST_LIGHT, dark_area
-from holod_training.shards import Shard, ShardError
+from holod_training.shards import Shard, ShardError, check_kind
 from holod_training.sheets import save_sheet
 
 KINDS = ("dots", "lines", "stars")
@@ -26,10 +26,7 @@ def judge_marks(shards: list[Shard], methods: list[Method], bench: Bench, sheet:
     ours, focused near and far at the widest pupil. Raises ShardError for scenes of another kind."""
     rows, pictures = [], []
     for shard in shards:
-        if shard.kind != "marks":
-            raise ShardError(
-                f"{shard.path}: a scene of kind {shard.kind!r}, expected marks; write it with --kind marks"
-            )
+        check_kind(shard, "marks")
         for index, pupil in enumerate(shard.pupils_mm):
             stack = bench.read(shard, index)
             dark = dark_area(stack.target)

@@ -13,7 +13,7 @@ from holod_training.config import OpticsConfig
 from holod_training.judging import OURS, Bench, Method, means
 from holod_training.loss import inner
 from holod_training.metrics import gradient_energy
-from holod_training.shards import Shard, ShardError
+from holod_training.shards import Shard, ShardError, check_kind
 from holod_training.sheets import SHEET_PUPILS_MM, save_sheet
 
 # On the default bench, for which scenes are laid out; on another, at the same place of its depth range.
@@ -54,6 +54,7 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
     focus = cards_dpt(bench.optics)
     of_all = [pupil for pupil in PUPILS_MM if all(pupil in shard.pupils_mm for shard in shards)]
     for shard in shards:
+        check_kind(shard, "cards")
         stack = bench.read(shard, 0)
         areas = card_areas(stack.depth, bench.border_px)
         for name, area in areas.items():

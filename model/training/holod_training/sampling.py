@@ -142,6 +142,17 @@ class Sampler:
             ]
         return drawn
 
+    def volume_blurs_px(self) -> tuple[float, float]:
+        """The least and the most blur over the depth volume of the pupils that are drawn."""
+        blurs = [
+            shard.optics.volume_blur_px(shard.pupils_mm[pupil])
+            for shard in self.shards
+            for pupil in (
+                map(shard.nearest_pupil, self.specialists_mm) if self.specialists_mm else range(len(shard.pupils_mm))
+            )
+        ]
+        return min(blurs), max(blurs)
+
     def _pupil(self, shard: Shard, rng: np.random.Generator) -> int:
         """Any of the shard's pupils; for specialists the one nearest to a random one of theirs. In a shard without
         one near, that may be nearer to another specialist, who then learns from it."""

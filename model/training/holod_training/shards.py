@@ -104,6 +104,7 @@ class Shard:
                 self.kind = metadata.get("kind", "")
                 self._check_format(metadata)
                 self.index = int(self._number(metadata, "index"))
+                self.seed = metadata.get("seed", "")
                 self.pupils_mm: tuple[float, ...] = tuple(self._list(metadata, "pupils_mm"))
                 self.focus_dpt: tuple[float, ...] = tuple(self._list(metadata, "focus_dpt"))
                 self.optics = self._rendered_for(metadata)
@@ -278,6 +279,12 @@ def open_test(folder: Path, limit: int | None = None) -> list[Shard]:
                 f"test`: name a folder of {shard.kind} with `evaluate --{shard.kind}`"
             )
     return shards
+
+
+def check_kind(shard: Shard, kind: str) -> None:
+    """Raises ShardError for a scene of another kind."""
+    if shard.kind != kind:
+        raise ShardError(f"{shard.path}: a scene of kind {shard.kind!r}, expected {kind}; write it with --kind {kind}")
 
 
 def check_pupils(shards: Sequence[Shard], pupils_mm: Sequence[float]) -> None:

@@ -63,6 +63,8 @@ from holod_training.variants import build_network, network_amplitude
 
 VALIDATION_PUPILS_MM = (2.0, 3.0, 4.0)
 PRECISIONS = ("f32", "bf16")
+# By which factor scenes may lie outside what a network is told of.
+TOLD = 1.01
 PERCEPTUAL_STREAM = 2
 # What of TrainConfig only programs can set: errors name it by its key.
 WITHOUT_OPTION = ("final_rate_share", "gradient_clip", "ema_decay", "log_every", "checkpoint_every", "rescan_every")
@@ -285,12 +287,22 @@ class Run:
 
     def _check_told(self, folder: str, bench: OpticsConfig) -> None:
         trained, found = self.config.network.trained, bench.volume_fresnel_px2
-        if trained.outside(bench) > 1.01:
+        if trained.outside(bench) > TOLD:
             least, most = trained.volume_fresnel_px2
             raise TrainingError(
                 f"{folder}: found scenes of a bench whose diffraction is {min(found):.1f} to "
                 f"{max(found):.1f} px2, expected {least:g} to {most:g}, which the network is told: give this bench's "
                 "`--volume-fresnel-px2` and `--volume-blur-px` (`holod check` says them), or `--benches any`"
+            )
+
+    def _check_blurs(self) -> None:
+        """Of a pupil outside its range a network is told the nearest within. Runs that began so go on."""
+        (least, most), (low, high) = self.config.network.trained.volume_blur_px, self.sampler.volume_blurs_px()
+        if low < least / TOLD or high > most * TOLD:
+            raise TrainingError(
+                f"{self.config.shards}: found scenes whose pupils blur by {low:.1f} to {high:.1f} px over the depth "
+                f"volume, expected {least:g} to {most:g} px, which the network is told: train with `--volume-blur-px "
+                f"{min(least, math.floor(low)):g},{max(most, math.ceil(high)):g}`, or with scenes of other `--pupils`"
             )
 
     def _precision(self) -> torch.autocast:
@@ -328,6 +340,8 @@ class Run:
             group["lr"] = rate
         stacks = [s.to(self.device) for s in self.sampler.draw(self.step, config.batch)]
         self._check_benches([s.optics for s in stacks])
+        if self.step == 0:
+            self._check_blurs()
         with self._precision():
             fields = self._fields(self.trained, config.network, stacks, [s.given_depth for s in stacks])
         taught = self._taught(stacks)
@@ -433,6 +447,7 @@ class Run:
             "format": "holod-checkpoint-1",
             "step": self.step,
             "seconds": self.seconds,
+            "processes": self.world,
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -454,6 +469,13 @@ class Run:
             raise TrainingError(
                 f"{self.config.out}: {'; '.join(other)}; resume with the options that config.json there has, or go on "
                 "with others in a folder of its own by --initial-weights"
+            )
+        # Older checkpoints do not say of how many.
+        if (processes := state.get("processes", self.world)) != self.world:
+            raise TrainingError(
+                f"{self.config.out}: found a checkpoint of {processes} process(es), expected {self.world}: each adds "
+                f"crops to every step; resume with `torchrun --nproc-per-node={processes}`, or go on in a folder of "
+                "its own by --initial-weights"
             )
         try:
             self.network.load_state_dict(state["network"])
@@ -573,6 +595,7 @@ def _train(
         mininterval=1 if sys.stderr.isatty() else 60,
     )
     window: list[dict[str, float]] = []
+    saved: int | None = None
     began = time.monotonic() - run.seconds
     while run.step < config.steps:
         window.append(run.train_step())
@@ -591,11 +614,15 @@ def _train(
             # Every rank meets here, so that none runs ahead of the files.
             if rank == 0:
                 run.save_checkpoint()
+            saved = run.step
             if world > 1:
                 dist.barrier()
         if log and (run.step % config.validate_every == 0 or done):
             _validate(run, log, weights)
         if interrupt.came:
+            if saved != run.step:
+                # It came while this step was validated.
+                run.save_checkpoint()
             left = (
                 f"{weights} is of the last step" if done else f"{checkpoint} is of step {run.step}: go on with --resume"
             )

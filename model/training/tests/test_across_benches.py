@@ -17,6 +17,7 @@ from holod_training.judging import Bench, network_field, open_alike
 from holod_training.variants import build_network
 
 TINY = NetworkConfig(layers=4, channels=4, adjustable_layers=(1,), modulation_hidden=4)
+SHIPPED = Path(__file__).parents[2] / "weights"
 GAEA = {"pixel_angle_rad": str(3.74e-6 / 40e-3), "pixel_pitch_um": "3.74", "wavelengths_nm": "[633.0, 532.0, 473.0]"}
 
 
@@ -83,6 +84,17 @@ def test_a_folder_without_scenes_is_said_before_the_long_work(tmp_path: Path) ->
     assert not (tmp_path / "out").exists()
 
 
+def test_two_benches_of_one_name_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_weights(tmp_path / "one.safetensors", build_network(TINY), {}, {})
+    command = ["across-benches", "--weights", str(tmp_path / "one.safetensors"), "--out", str(tmp_path / "out")]
+    for bench, metadata in (("default", {}), ("gaea", GAEA)):
+        write_shard(tmp_path / bench / "test" / "scene_000000.safetensors", metadata=metadata)
+        command += ["--test", str(tmp_path / bench / "test")]
+    assert main([*command, "--border-px", "8"]) == 65
+    assert "--test: found two folders of one name" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_borders_and_limits_that_leave_nothing_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_weights(tmp_path / "one.safetensors", build_network(TINY), {}, {})
     write_shard(tmp_path / "test" / "scene_000000.safetensors")
@@ -116,3 +128,44 @@ def test_export_carries_what_a_network_reached_on_each_bench(tmp_path: Path) -> 
     assert bench["rows"][1]["psnr_db"] == pytest.approx(judged["rows"][1]["psnr_db"], abs=0.006)
     gain = judged["gain_over_rival"]["one"][1]["psnr_db"]["mean"]
     assert bench["rows"][1]["over_smooth_phase_db"] == pytest.approx(gain, abs=0.006)
+
+
+def test_figures_of_other_weights_or_of_another_constant_are_not_exported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch.manual_seed(1)
+    source, out, table = (tmp_path / name for name in ("one.safetensors", "out/one.safetensors", "benches.json"))
+    network = build_network(TINY)
+    save_weights(source, network, {"seed": 1}, {})
+    write_shard(tmp_path / "default" / "scene_000000.safetensors")
+    command = ["across-benches", "--weights", str(source), "--test", str(tmp_path / "default"), "--border-px", "8"]
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    export = ["export", "--source", str(source), "--out", str(out), "--benches", str(table)]
+
+    def refused(*options: str) -> str:
+        capsys.readouterr()
+        assert main([*export, *options]) == 65 and not out.exists()
+        return capsys.readouterr().err
+
+    told = refused("--amplitude-constant", "4")
+    assert "benches.json: amplitude_constant: found 1.4, expected 4, that of the file to write" in told
+    with torch.no_grad():
+        next(network.parameters())[0] += 1e-6
+    save_weights(source, network, {"seed": 1}, {})
+    assert "benches.json: weights_sha256 of 'one': found " in refused()
+    older = {key: value for key, value in json.loads(table.read_text()).items() if key != "networks"}
+    table.write_text(json.dumps(older))
+    assert "does not say of which weights its figures are" in refused()
+    for content in ("[]", "{}", '{"benches": [1], "networks": [1]}', '{"benches": 1, "networks": 1}'):
+        table.write_text(content)
+        assert "benches.json: " in refused()
+    table.write_bytes(b"\xff")
+    assert "benches.json: not a table across benches" in refused()
+
+
+@pytest.mark.parametrize("name", ["standard", "small", "fast"])
+def test_the_shipped_table_is_of_the_shipped_weights(name: str, tmp_path: Path) -> None:
+    shipped, out = SHIPPED / f"{name}.safetensors", tmp_path / f"{name}.safetensors"
+    benches = SHIPPED / "evaluation" / "benches.json"
+    assert main(["export", "--source", str(shipped), "--out", str(out), "--benches", str(benches)]) == 0
+    assert read_metadata(out) == read_metadata(shipped)

@@ -38,7 +38,7 @@ from holod_training.rivals import (
     smooth_phase,
     transport_of_intensity,
 )
-from holod_training.shards import Shard, Stack
+from holod_training.shards import Shard, ShardError, Stack
 from holod_training.solver import Solution, optimise
 from holod_training.variants import build_network, variant
 
@@ -49,7 +49,7 @@ OPTICS = OpticsConfig()
 
 
 def write_card(path: Path, seed: int, metadata: dict[str, str] | None = None) -> None:
-    write_shard(path, seed=seed, size=128, pupils_mm=(1.0, 2.0), metadata=metadata)
+    write_shard(path, seed=seed, size=128, pupils_mm=(1.0, 2.0), metadata={"kind": "cards", **(metadata or {})})
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()
     tensors = load_file(path)
@@ -384,6 +384,28 @@ def test_cards_and_marks_must_be_alike(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_scene_that_is_there_twice_is_refused(evaluation: Path, tmp_path: Path, capsys) -> None:
+    for name in ("scene_000000", "scene_000007"):
+        write_shard(tmp_path / "test" / f"{name}.safetensors", seed=3, pupils_mm=PUPILS)
+        write_card(tmp_path / "cards" / f"{name}.safetensors", seed=3)
+    command = ["evaluate", "--weights", str(evaluation / "w.safetensors"), "--out", str(tmp_path / "out"), "--test"]
+    for options in (
+        [str(tmp_path / "test")],
+        [str(evaluation / "test"), "--cards", str(tmp_path / "cards")],
+    ):
+        assert main([*command, *options]) == 65
+        error = capsys.readouterr().err
+        assert re.search(r"scene_000007\.safetensors: found number 3 of seed 3, as in .*scene_000000", error)
+    assert not (tmp_path / "out").exists()
+
+
+def test_scenes_of_another_kind_are_no_cards(tmp_path: Path) -> None:
+    write_card(tmp_path / "scene_000000.safetensors", seed=0, metadata={"kind": "marks"})
+    shards = [Shard(tmp_path / "scene_000000.safetensors")]
+    with pytest.raises(ShardError, match="kind 'marks', expected cards"):
+        refocus_cards(shards, rivals(OPTICS)[:1], Bench(OPTICS, 1.25, 8), tmp_path / "sheet.png")
+
+
 def test_judged_between_what_methods_know(tmp_path: Path, evaluation: Path, capsys, monkeypatch) -> None:
     """Changes the pictures at the focuses that are asked for, or those between, and sees whose numbers change."""
     known: dict[str, set[tuple[float, ...]]] = {"evaluate": set(), "tradeoff": set()}
@@ -502,6 +524,27 @@ def test_export_stamps_the_constant_and_the_evaluation(
     also = ["--source", str(evaluation / "deeper.safetensors"), "--out", str(out), *judged]
     assert main(["export", *also, "--evaluation-method", "deeper"]) == 0
     assert "matrix_psnr_db" not in read_metadata(out)["metrics"]
+
+
+def test_figures_stay_with_their_amplitude_constant(evaluation: Path, tmp_path: Path) -> None:
+    source, out = tmp_path / "source.safetensors", tmp_path / "out.safetensors"
+    network = load_weights(evaluation / "w.safetensors")
+    save_weights(source, network, {"rows": [1]}, {})
+    for constant, expected in (("1.4", {"rows": [1]}), ("4", {})):
+        assert (
+            main(["export", "--source", str(source), "--out", str(out), "--amplitude-constant", constant, "--force"])
+            == 0
+        )
+        assert read_metadata(out)["metrics"] == expected
+
+
+def test_what_is_no_evaluation_is_told_without_a_traceback(
+    evaluation: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--source", str(evaluation / "w.safetensors"), "--out", str(tmp_path / "x.safetensors")]
+    for option, told in (("--evaluation", "not an evaluation"), ("--benches", "not a table across benches")):
+        assert main(["export", *arguments, option, str(evaluation / "out" / "scenes.json")]) == 65
+        assert f"scenes.json: {told}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

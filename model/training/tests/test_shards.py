@@ -8,7 +8,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from holod_training.benches import ANY_BENCH, BenchDraw
-from holod_training.config import ConfigError, OpticsConfig
+from holod_training.config import ConfigError, OpticsConfig, TrainedRange
 from holod_training.optics import coc_px
 from holod_training.sampling import AugmentConfig, Sampler, augment
 from holod_training.shards import Shard, ShardError, Stack, open_held_out, open_shards, shard_names
@@ -168,6 +168,12 @@ def test_each_crop_has_a_bench_of_its_own_where_benches_are_drawn(shards: Path) 
     again = Sampler(shards, 32, 1, 0, AugmentConfig(), benches=BenchDraw())
     again.rescan()
     assert again.draw(7, 1)[0].optics == drawn[7].optics
+
+
+def test_the_default_bench_is_not_drawn_where_networks_are_not_for_it() -> None:
+    rng, apart = np.random.default_rng(1), TrainedRange((20.0, 250.0), (100.0, 400.0))
+    drawn = [BenchDraw(apart).draw(60.0, rng) for _ in range(40)]
+    assert all(100 <= fresnel <= 400 for bench in drawn for fresnel in bench.volume_fresnel_px2)
 
 
 def test_a_blur_that_no_bench_shows_is_said() -> None:

@@ -22,7 +22,7 @@ from holod_training.benches import ANY_BENCH, BenchDraw
 from holod_training.cli import main
 from holod_training.compare import compare
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig, TrainedRange
-from holod_training.export import WeightsError, export, load_weights, read_metadata, save_weights
+from holod_training.export import WeightsError, export, load_weights, read_checkpoint, read_metadata, save_weights
 from holod_training.loss import LossWeights, focus_loss
 from holod_training.network import DirectNetwork
 from holod_training.optics import HalfBandEye
@@ -186,7 +186,11 @@ def test_other_options_than_the_checkpoints_are_refused_by_name(shards: Path, tm
             resume(**changes)
     elsewhere = {"out": str(tmp_path / "moved"), "initial_weights": None, "validation": None}
     assert resume(steps=9, validate_every=1, learning_rate=1e-3, precision="bf16", **elsewhere) == 1
+    state["processes"] = 2
+    with pytest.raises(TrainingError, match=r"found a checkpoint of 2 process\(es\), expected 1: .* with `torchrun"):
+        resume()
     # An older checkpoint lacks what is as it was.
+    del state["processes"]
     stored = json.loads(state["config"])
     del stored["double_phase"], stored["loss"]["foam"], stored["network"]["feedback"]
     state["config"] = json.dumps(stored)
@@ -399,6 +403,24 @@ def test_options_change_the_variant_that_they_name() -> None:
         benches("--volume-blur-px", "20")
 
 
+def test_what_initial_weights_are_for_stays_unless_options_name_it(tmp_path: Path) -> None:
+    network = dataclasses.replace(TINY, trained=TrainedRange((10.0, 90.0), (20.0, 50.0)), amplitude_constant=1.25)
+    start = tmp_path / "start.safetensors"
+    save_weights(start, build_network(network), {}, {})
+
+    def going_on(*more: str) -> NetworkConfig:
+        common = ["--shards", "a", "--out", "b", "--steps", "1", "--initial-weights", str(start)]
+        options = cli._parser().parse_args(["train", *common, *more])
+        return cli._train_config(options, network=cli._network(options)).network
+
+    assert (going_on().trained, going_on().amplitude_constant) == (network.trained, 1.25)
+    assert going_on("--volume-blur-px", "5,115").trained == TrainedRange((5.0, 115.0), (20.0, 50.0))
+    assert going_on("--benches", "any").trained == ANY_BENCH
+    assert going_on("--double-phase", "1.1").amplitude_constant == 1.1
+    with pytest.raises(WeightsError, match="not a readable weights file"):
+        going_on("--initial-weights", str(tmp_path / "none.safetensors"))
+
+
 def test_each_step_has_a_bench_of_its_own(shards: Path, tmp_path: Path) -> None:
     """The network makes its field for the bench that the crop was drawn for."""
     network = dataclasses.replace(TINY, trained=ANY_BENCH)
@@ -487,7 +509,7 @@ def test_scenes_of_another_bench_are_refused(shards: Path, tmp_path: Path) -> No
         (shards / f"scene_{index:06}.safetensors").unlink()
     with pytest.raises(TrainingError, match=r"diffraction is 147\.\d to 208\.\d px2, expected 32 to 46"):
         Run(tiny(shards, tmp_path / "other", batch=4, validation=None), CPU).train_step()
-    network = dataclasses.replace(TINY, trained=ANY_BENCH)
+    network = dataclasses.replace(TINY, trained=TrainedRange((5.0, 125.0), ANY_BENCH.volume_fresnel_px2))
     assert Run(tiny(shards, tmp_path / "told", batch=4, network=network, validation=None), CPU).train_step()["loss"] > 0
 
 
@@ -501,6 +523,26 @@ def test_validation_scenes_of_another_bench_are_refused_before_the_first_step(sh
             Run(tiny(shards, tmp_path / "run", network=gaea, benches=benches), CPU)
     any_bench = dataclasses.replace(TINY, trained=ANY_BENCH)
     Run(tiny(shards, tmp_path / "run", network=any_bench, benches=BenchDraw()), CPU)
+
+
+def test_scenes_of_pupils_that_the_network_is_not_told_are_refused(tmp_path: Path) -> None:
+    for index, pupils_mm in enumerate(((0.4, 2.0), (3.0, 7.99))):
+        write_shard(tmp_path / "s" / f"scene_{index:06}.safetensors", seed=index, pupils_mm=pupils_mm)
+    config = tiny(tmp_path / "s", tmp_path / "run", validation=None)
+    told = (
+        r"s: found scenes whose pupils blur by 5\.7 to 114\.1 px .*, expected 14 to 72 px, .*`--volume-blur-px 5,115`"
+    )
+    with pytest.raises(TrainingError, match=told):
+        train(config, CPU)
+    assert not (tmp_path / "run").exists()
+    run = Run(config, CPU)
+    run.step = 1
+    run.sampler.rescan()
+    run.train_step()
+    wide = dataclasses.replace(TINY, trained=TrainedRange((5.0, 115.0)))
+    Run(dataclasses.replace(config, network=wide), CPU).train_step()
+    specialists = dataclasses.replace(TINY, specialists_mm=(2.0, 3.0))
+    Run(dataclasses.replace(config, network=specialists), CPU).train_step()
 
 
 @pytest.mark.usefixtures("no_plots")
@@ -831,6 +873,26 @@ def test_an_interrupt_leaves_a_checkpoint_and_no_traceback(
     assert main([*command, str(tmp_path / "cut"), "--resume"]) == 0
     whole, cut = (load_file(tmp_path / name / "weights.safetensors") for name in ("whole", "cut"))
     assert all(torch.equal(value, cut[name]) for name, value in whole.items())
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_an_interrupt_while_a_step_is_validated_leaves_its_checkpoint(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    validate = Run.validate
+
+    def interrupted(self: Run) -> dict[str, dict[str, float]]:
+        signal.raise_signal(signal.SIGINT)
+        return validate(self)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        monkeypatch.setattr(Run, "validate", interrupted)
+        with pytest.raises(KeyboardInterrupt, match=r"checkpoint\.pt is of step 2: go on with --resume"):
+            train(tiny(shards, tmp_path / "run", validate_every=2), CPU)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert read_checkpoint(tmp_path / "run" / "checkpoint.pt")["step"] == 2
 
 
 def test_an_out_that_is_no_folder_is_refused_before_the_work(
