@@ -9,9 +9,10 @@ use std::path::{Component, Path, PathBuf};
 const INSTALLED: &str = "/usr/share/doc/holod";
 
 /// What is taken from the sources, a file or a folder with what lies in it, and its name among the documentation.
-const HELD: [(&str, &str); 18] = [
+const HELD: [(&str, &str); 19] = [
     ("README.md", "README.md"),
     ("deploy/README.md", "service.md"),
+    ("calibration/doc", ""),
     ("daemon/doc", ""),
     ("slm-output/doc", ""),
     ("pupil-input/doc", ""),
