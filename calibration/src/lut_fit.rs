@@ -226,7 +226,7 @@ impl Told {
     /// By the arccosine of a share of the light, on the branch from `branch`·π to the next.
     fn by_branch(share: f64, branch: usize) -> Self {
         let rising = (1.0 - 2.0 * share.clamp(0.0, 1.0)).acos();
-        let phase_rad = branch as f64 * PI + if branch % 2 == 0 { rising } else { PI - rising };
+        let phase_rad = branch as f64 * PI + if branch.is_multiple_of(2) { rising } else { PI - rising };
         Self { phase_rad, slope: 0.5 * phase_rad.sin() }
     }
 
