@@ -45,7 +45,7 @@ pub(super) fn read_depth(path: &Path, is_alone: bool) -> Result<DepthRaster, Sce
         Format::Other => {
             let (picture, turned) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
-            let bits = png_grey_bits(path).map_err(|source| read_error(path, source))?;
+            let bits = File::open(path).and_then(png_grey_bits).map_err(|source| read_error(path, source))?;
             let mut numbers = depth_numbers(path, picture)?;
             if let Some(bits @ ..8) = bits {
                 numbers.shrink_to(bits);
