@@ -9,9 +9,12 @@ use std::path::Path;
 /// Bytes written at a time.
 const BUFFER_BYTES: usize = 1 << 16;
 
-/// What is at `path` where it is, or leads to, something that no file may take the place of: a device, a pipe or a
-/// socket.
+/// What is at `path` where it is, or leads to, something that no file may take the place of: a device, a pipe, a
+/// socket, or a file that a process has open.
 pub fn special_file(path: &Path) -> Option<&'static str> {
+    if is_open_file(path) {
+        return Some("a file that is open already");
+    }
     let kind = fs::metadata(path).ok()?.file_type();
     let kinds = [
         (kind.is_char_device() || kind.is_block_device(), "a device"),
@@ -19,6 +22,27 @@ pub fn special_file(path: &Path) -> Option<&'static str> {
         (kind.is_socket(), "a socket"),
     ];
     kinds.into_iter().find(|(is_it, _)| *is_it).map(|(_, name)| name)
+}
+
+/// Whether `path` leads by links into a process's table of open files, as `/dev/stdout` does.
+fn is_open_file(path: &Path) -> bool {
+    /// As many as Linux follows.
+    const LINKS_MAX: usize = 40;
+    let mut path = path.to_owned();
+    for _ in 0..LINKS_MAX {
+        let Ok(target) = fs::read_link(&path) else { return false };
+        let Ok(folder) = folder_of(&path).canonicalize() else { return false };
+        if folder.starts_with("/proc") && folder.ends_with("fd") {
+            return true;
+        }
+        path = folder.join(target);
+    }
+    false
+}
+
+/// The folder in which a path's last part is.
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Writes a file beside its place, and moves it there when it is whole and on the disk: whoever looks sees all of it or
@@ -46,9 +70,8 @@ pub fn write_atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::R
         let _ = fs::remove_file(&beside);
     }
     written?;
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     // The file is in its place and whole; that a folder cannot be synced, as on some network disks, does not undo that.
-    let _ = File::open(folder).and_then(|folder| folder.sync_all());
+    let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
     Ok(())
 }
 
@@ -81,6 +104,24 @@ mod tests {
             assert!(write_atomically(nowhere, |_| Ok(())).is_err(), "{}", nowhere.display());
         }
         assert_eq!(fs::read_dir(dir.path()).expect("reads").count(), 1);
+    }
+
+    #[test]
+    fn an_open_file_is_not_replaced_by_another() {
+        use std::os::fd::AsRawFd;
+        let dir = tempfile::TempDir::new().expect("a folder");
+        let file = File::create(dir.path().join("redirected")).expect("a file");
+        let links = [
+            format!("/dev/fd/{}", file.as_raw_fd()),
+            format!("/proc/self/fd/{}", file.as_raw_fd()),
+            format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()),
+        ];
+        let link = dir.path().join("link");
+        std::os::unix::fs::symlink(&links[0], &link).expect("a link");
+        for path in links.iter().map(Path::new).chain([&*link]) {
+            assert_eq!(special_file(path), Some("a file that is open already"), "{}", path.display());
+        }
+        assert_eq!(special_file(&dir.path().join("redirected")), None);
     }
 
     #[test]

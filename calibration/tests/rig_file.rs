@@ -900,6 +900,16 @@ fn a_table_whose_range_is_like_multiples_of_pi_is_asked_for_its_unit() {
     assert!(load_lut(&lut_csv(straight)).unwrap().warnings().is_empty());
 }
 
+#[test]
+fn short_strokes_of_colours_that_are_not_lit_are_not_told() {
+    let short = ("red = 1.9921875", "red = 0.8");
+    let told = |changes: &[(&str, &str)]| strokes_told(&Rig::parse(&changed(changes), Path::new("")).unwrap()).len();
+    assert_eq!(told(&[short]), 1);
+    assert_eq!(told(&[short, ("power_mw = { red = 1.0", "power_mw = { red = 0.0")]), 0);
+    let monochrome = ("mode = \"channel-packed\"", "mode = \"monochrome\"\ncolour = \"green\"");
+    assert_eq!(told(&[short, monochrome]), 0);
+}
+
 fn strokes_told(rig: &Rig) -> Vec<String> {
     rig.warnings().into_iter().filter(|said| said.contains("the panel's stroke is")).collect()
 }

@@ -516,9 +516,9 @@ pub struct BenchArgs {
     /// and then (make), beside a copy of its bytes in memory.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution, num_args = 0..=1, default_missing_value = "1920x1080")]
     pub feed: Option<Resolution>,
-    /// Size of the hologram.
-    #[arg(long, value_name = "WxH", value_parser = parse_resolution, default_value = "512x512")]
-    pub resolution: Resolution,
+    /// Size of the hologram, 512x512 unless the panel is smaller.
+    #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
+    pub resolution: Option<Resolution>,
     /// Frames of which medians and quartiles are taken.
     #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u32).range(1..))]
     pub repeat: u32,

@@ -21,10 +21,11 @@ pub(crate) enum Destination {
 }
 
 impl Destination {
-    /// The place that `option` names. What is there already is overwritten with `force` only.
+    /// The place that `option` names, in a folder that is made where it is missing. What is there already is overwritten
+    /// with `force` only.
     ///
     /// # Errors
-    /// A file is there already, or a directory, device, pipe or socket.
+    /// A file is there already, or a directory, device, pipe or socket; or no file can be written there.
     pub(crate) fn new(path: &Path, option: &str, force: bool) -> Result<Self, Failure> {
         if path == Path::new("-") {
             return Ok(Self::Stdout);
@@ -32,12 +33,22 @@ impl Destination {
         let expected = "expected the name of a file to write";
         let trouble = match special_file(path) {
             Some(found) => Some(format!("found {found}, {expected}; {option} - is standard output")),
-            None => path.is_dir().then(|| format!("found a directory, {expected}")),
+            None => names_a_directory(path).then(|| format!("found a directory, {expected}")),
         };
         if let Some(trouble) = trouble {
             return Err(Failure::new(Exit::CannotCreate, format!("{option} {}: {trouble}", path.display())));
         }
         refuse_existing([path.to_owned()], option, force)?;
+        let folder = folder_of(path);
+        std::fs::create_dir_all(folder).map_err(|error| {
+            let what = format!("cannot make the folder {}: {error}; name one that can be", folder.display());
+            Failure::new(Exit::CannotCreate, what)
+        })?;
+        // It goes at once: what takes long to compute should not be lost for want of a place.
+        tempfile::tempfile_in(folder).map_err(|error| {
+            let what = format!("{option} {}: cannot write into its folder: {error}; name another one", path.display());
+            Failure::new(Exit::CannotCreate, what)
+        })?;
         Ok(Self::File(path.to_owned()))
     }
 
@@ -46,20 +57,13 @@ impl Destination {
         matches!(self, Self::Stdout)
     }
 
-    /// Lets `write` write the file, whose folder is made where it is missing.
+    /// Lets `write` write the file.
     ///
     /// # Errors
     /// That of `write`, or standard output takes no more.
     pub(crate) fn write(&self, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
         match self {
-            Self::File(path) => {
-                let folder = folder_of(path);
-                std::fs::create_dir_all(folder).map_err(|error| {
-                    let what = format!("cannot make the folder {}: {error}; name one that can be", folder.display());
-                    Failure::new(Exit::CannotCreate, what)
-                })?;
-                write(path)
-            }
+            Self::File(path) => write(path),
             Self::Stdout => {
                 let folder = Temporary::new("holod-").map_err(Failure::because(Exit::CannotCreate))?;
                 let path = folder.path().join("out");
@@ -72,6 +76,11 @@ impl Destination {
             }
         }
     }
+}
+
+/// Whether `path` is a directory, or could be nothing else.
+fn names_a_directory(path: &Path) -> bool {
+    path.is_dir() || path.as_os_str().as_encoded_bytes().ends_with(b"/") || path.file_name().is_none()
 }
 
 #[cfg(test)]
@@ -108,6 +117,20 @@ mod tests {
         let refused = put(&folder.path().join("a/b/c.png/d.png")).unwrap_err();
         assert!(refused.to_string().contains("cannot make the folder"), "{refused}");
         assert_eq!(refused.exit, Exit::CannotCreate);
+    }
+
+    #[test]
+    fn a_place_that_takes_no_file_is_refused_before_it_is_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let refused = |path: &Path| Destination::new(path, "--out", false).unwrap_err().to_string();
+        let slash = refused(&folder.path().join("new/"));
+        assert!(slash.contains("found a directory, expected the name of a file"), "{slash}");
+        assert!(!folder.path().join("new").exists());
+        // Nobody, not even root, makes files there.
+        let proc = refused(Path::new("/proc/y.png"));
+        assert!(proc.contains("--out /proc/y.png: cannot write into its folder"), "{proc}");
+        Destination::new(&folder.path().join("y.png"), "--out", false).unwrap();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 
     #[test]

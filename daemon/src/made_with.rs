@@ -1,14 +1,13 @@
 //! What holograms are made with, as reports say it.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 
 use holod_calibration::Colour;
 use holod_calibration::rig::Rig;
+use holod_model::Weights;
 use serde::Serialize;
 
-use crate::failure::{Exit, Failure};
-use crate::record::{content_xxh3, weights_file};
+use crate::record::hash_text;
 use crate::setup;
 
 /// The rig and its weights.
@@ -16,7 +15,7 @@ use crate::setup;
 pub struct MadeWith {
     /// The network's weights by name, or their file's name.
     pub weights: String,
-    /// XXH3 of 64 bits of the weights' file, hexadecimal; none of built-in ones.
+    /// XXH3 of 64 bits of the weights' file as it was loaded, hexadecimal; none of built-in ones.
     pub weights_xxh3: Option<String>,
     /// The rig's name.
     pub rig: String,
@@ -28,33 +27,28 @@ pub struct MadeWith {
 }
 
 impl MadeWith {
-    /// What `rig` makes holograms with.
-    ///
-    /// # Errors
-    /// A file cannot be read.
-    pub fn of(rig: &Rig) -> Result<Self, Failure> {
-        Ok(Self {
+    /// What `rig` makes holograms with, whose weights were loaded; of files it says what was in them then.
+    pub fn of(rig: &Rig, weights: &Weights) -> Self {
+        Self {
             weights: setup::weights_name(&rig.model.weights),
-            weights_xxh3: weights_file(&rig.model.weights)?.map(|file| file.xxh3),
+            weights_xxh3: weights.file_xxh3().map(hash_text),
             rig: rig.name.clone(),
             rig_hash: rig.provenance.hash_text(),
-            rig_tables_xxh3: tables_xxh3(rig)?,
-        })
+            rig_tables_xxh3: tables_xxh3(rig),
+        }
     }
 }
 
-fn tables_xxh3(rig: &Rig) -> Result<BTreeMap<String, String>, Failure> {
+fn tables_xxh3(rig: &Rig) -> BTreeMap<String, String> {
     let mut tables = BTreeMap::new();
     for (key, files) in [("lut_file", &rig.provenance.lut_files), ("flatness_file", &rig.provenance.flatness_files)] {
         for colour in Colour::ALL {
-            let Some(path) = &files[colour] else { continue };
-            let (_, xxh3) = File::open(path).and_then(|mut file| content_xxh3(&mut file)).map_err(|error| {
-                Failure::new(Exit::NoInput, format!("panel.{key}.{colour}: cannot read {}: {error}", path.display()))
-            })?;
-            tables.insert(format!("panel.{key}.{colour}"), xxh3);
+            if let Some(table) = &files[colour] {
+                tables.insert(format!("panel.{key}.{colour}"), hash_text(table.xxh3));
+            }
         }
     }
-    Ok(tables)
+    tables
 }
 
 #[cfg(test)]
@@ -62,9 +56,10 @@ mod tests {
     use std::fs;
 
     use super::*;
+    use crate::record::SourceFile;
 
     #[test]
-    fn a_table_that_changes_changes_what_is_said_of_it() {
+    fn files_are_told_as_they_were_loaded() {
         let folder = tempfile::tempdir().unwrap();
         let lut = |most_rad: f64| -> String {
             (0..256).map(|level| format!("{level},{}\n", f64::from(level) * most_rad / 255.0)).collect()
@@ -76,16 +71,21 @@ mod tests {
         fs::write(&config, text).unwrap();
         fs::write(&table, lut(6.1)).unwrap();
         let rig = Rig::load(&config).unwrap();
-        let said = MadeWith::of(&rig).unwrap();
-        assert_eq!(said.rig_tables_xxh3.keys().collect::<Vec<_>>(), ["panel.lut_file.green"]);
-        assert_eq!(MadeWith::of(&rig).unwrap().rig_tables_xxh3, said.rig_tables_xxh3);
+        let weights = folder.path().join("w.safetensors");
+        fs::copy(concat!(env!("CARGO_MANIFEST_DIR"), "/../model/weights/fast.safetensors"), &weights).unwrap();
+        let loaded = Weights::load(&weights).unwrap();
+        let xxh3 = |path| SourceFile::of(path, String::new()).unwrap().xxh3;
+        let expected = [xxh3(&weights), xxh3(&table)];
+        fs::write(&weights, "another file").unwrap();
         fs::write(&table, lut(6.2)).unwrap();
-        let changed = MadeWith::of(&rig).unwrap();
-        assert_eq!(changed.rig_hash, said.rig_hash);
-        assert_ne!(changed.rig_tables_xxh3, said.rig_tables_xxh3);
-        fs::remove_file(&table).unwrap();
-        let failure = MadeWith::of(&rig).map(|_| ()).unwrap_err();
-        assert!(failure.to_string().contains("panel.lut_file.green: cannot read"), "{failure}");
-        assert!(MadeWith::of(&Rig::default()).unwrap().rig_tables_xxh3.is_empty());
+        let said = MadeWith::of(&rig, &loaded);
+        let table_xxh3 = &said.rig_tables_xxh3["panel.lut_file.green"];
+        assert_eq!([said.weights_xxh3.as_ref().unwrap(), table_xxh3], [&expected[0], &expected[1]]);
+        assert_eq!(said.rig_tables_xxh3.len(), 1);
+
+        let changed = MadeWith::of(&Rig::load(&config).unwrap(), &Weights::builtin_fast());
+        assert_eq!((&changed.rig_hash, &changed.weights_xxh3), (&said.rig_hash, &None));
+        assert_eq!(changed.rig_tables_xxh3["panel.lut_file.green"], xxh3(&table));
+        assert!(MadeWith::of(&Rig::default(), &loaded).rig_tables_xxh3.is_empty());
     }
 }

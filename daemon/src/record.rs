@@ -23,7 +23,7 @@ pub(crate) use self::frame_log::FrameLog;
 pub(crate) use self::health::{RecordCondition, RecordHealth, RecordState};
 pub(crate) use self::recorder::{LOG, ORDER_FILES, OrderSource, RUN, Recorder, RunFacts};
 pub(crate) use self::sources::{
-    BENCH, Hashed, RIG, SCENE, SceneSource, SourceFile, content_xxh3, hash_text, is_of_bench, is_weights, weights_file,
+    BENCH, Hashed, RIG, SCENE, SceneSource, SourceFile, content_xxh3, hash_text, is_of_bench, is_weights,
 };
 
 /// What the frame loop did for one frame.

@@ -55,7 +55,7 @@ pub fn rig_to_show(args: &RigArgs, network: &NetworkArgs) -> Result<Rig, Failure
 
 /// Warns of what the rig's panel cannot show.
 pub fn warn_of_panel(rig: &Rig) {
-    for warning in rig.panel.warnings() {
+    for warning in rig.panel_warnings() {
         tracing::warn!("{warning}");
     }
 }

@@ -57,6 +57,14 @@ impl Staging {
                 format!("cannot write into {}: it is a file; name a directory with --out", target.display()),
             ));
         }
+        if !target.exists() && target.is_symlink() {
+            let what = format!(
+                "cannot write into {}: it is a link that leads nowhere; make the directory that it names, or name \
+                 another one with --out",
+                target.display()
+            );
+            return Err(Failure::new(Exit::CannotCreate, what));
+        }
         refuse_existing(files.iter().map(|file| target.join(file)), "--out", force)?;
         fs::create_dir_all(folder).map_err(cannot)?;
         take_away_on_signals();
@@ -205,6 +213,18 @@ mod tests {
         staging.commit().unwrap();
         assert_eq!(fs::read_to_string(target.join("x")).unwrap(), "whole");
         assert_eq!(fs::read_dir(root.path().join("a")).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_link_that_leads_nowhere_is_refused_at_once() {
+        let root = tempfile::tempdir().unwrap();
+        let link = root.path().join("out");
+        std::os::unix::fs::symlink("nowhere", &link).unwrap();
+        let refused = Staging::new(&link, &["x"], true).err().unwrap();
+        assert_eq!(refused.exit, Exit::CannotCreate);
+        assert!(refused.to_string().contains("is a link that leads nowhere; make the directory"), "{refused}");
+        fs::create_dir(root.path().join("nowhere")).unwrap();
+        assert!(Staging::new(&link, &["x"], false).is_ok());
     }
 
     #[test]

@@ -381,10 +381,10 @@ impl Hologram {
         self.pupil_mm
     }
 
-    /// Share of samples whose amplitude exceeded the double phase's constant, 0 to 1.
+    /// Share of samples whose amplitude exceeded the double phase's constant, 0 to 1, of the colours that are lit.
     #[getter]
     fn clipped_share(&self) -> f32 {
-        self.rendered.clipped_share
+        self.rendered.clipped_where_lit(self.rig.light())
     }
 
     /// Share of each colour's pixels whose phase the panel cannot reach, 0 to 1.
@@ -435,7 +435,7 @@ impl Hologram {
             "<holod.Hologram {} for {} mm, {:.3} % clipped, {:.0} ms by {}>",
             self.encoder.pattern_resolution(),
             self.pupil_mm,
-            self.rendered.clipped_share * 100.0,
+            self.clipped_share() * 100.0,
             self.frame_ms,
             self.engine
         )

@@ -476,8 +476,10 @@ impl Pattern {
         let largest_m = radius_of(shortest_m / (4.0 * pitch_m), focal_length_m);
         let radius_m = radius.map_or(IDENTITY_RADIUS_SHARE * largest_m, |radius| radius.0);
         if !(radius_m > 0.0 && radius_m < largest_m) {
-            let expected =
-                format!("above 0 and below the {:.3} mm that pass the stop in every colour", 1e3 * largest_m);
+            let expected = format!(
+                "above 0 and below the {:.3} mm that pass the stop whichever laser lights a field",
+                1e3 * largest_m
+            );
             return Err(wrong("radius", format!("{:.3} mm", 1e3 * radius_m), expected));
         }
         let sine = (radius_m / focal_length_m).atan().sin();
@@ -1028,9 +1030,13 @@ mod tests {
             assert!(share >= 0.95, "{field}: {share}");
             assert!((own.share - envelope(per_px)).abs() < 1e-3, "{field}: {own:?}");
         }
+        // Just within it the longest wavelength passes in the field of the shortest, just beyond it would not.
+        let widest = Pattern::FieldIdentity { radius: Some(Metres(0.56e-3)) };
+        let red_in_blue = orders(&widest, Colour::Blue, Colour::Red).unwrap()[0];
+        assert!(red_in_blue.passes_stop, "{red_in_blue:?}");
         let too_far = Pattern::FieldIdentity { radius: Some(Metres(0.57e-3)) };
         let error = orders(&too_far, Colour::Red, Colour::Red).unwrap_err().to_string();
-        assert!(error.contains("below the 0.563 mm that pass the stop"), "{error}");
+        assert!(error.contains("below the 0.563 mm that pass the stop whichever laser"), "{error}");
     }
 
     #[test]

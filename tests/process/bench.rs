@@ -88,3 +88,14 @@ fn bench_leaves_the_loop_out_and_refuses_what_is_larger_than_the_panel() {
     assert_eq!(ended.status.code(), Some(64));
     assert!(ended.stderr.contains("found 4000x48"), "{ended:?}");
 }
+
+#[test]
+fn bench_takes_a_small_panels_own_size() {
+    let folder = holod_tests::new_folder();
+    std::fs::write(folder.path().join("rig.toml"), holod_tests::small_rig(96, 64, "driver = \"simulated\"")).unwrap();
+    let args = ["bench", "--config", "rig.toml", "--backend", "cpu", "--weights", "fast", "--repeat", "1"];
+    let ended = run(HOLOD, &[&args[..], &["--duration", "0s", "--json"]].concat(), folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let report: Value = serde_json::from_str(&ended.stdout).unwrap();
+    assert_eq!(report["resolution"], "96x64");
+}

@@ -63,6 +63,19 @@ fn a_folder_of_images_becomes_the_hologram_that_the_engine_makes_of_it() {
     expected.field.swap(100, 700);
     assert!(apart(&expected) > 1e-3, "the comparison is blind");
 
+    assert!(!ended.stderr.contains("were clipped"), "{}", ended.stderr);
+    // The same weights with a constant above which most amplitudes are.
+    let mut bytes = fs::read(&weights).unwrap();
+    let key = br#"amplitude_constant\": "#;
+    let at = bytes.windows(key.len()).position(|window| window == key).unwrap() + key.len();
+    bytes[at..][..3].copy_from_slice(b"0.1");
+    let loud = folder.path().join("loud.safetensors");
+    fs::write(&loud, bytes).unwrap();
+    let args = ["render", "--focal-stack", "stack", "--weights", "loud.safetensors", "--out", "loud"];
+    let ended = run(HOLOD, &args, folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    assert!(ended.stderr.contains("amplitude_constant of the weights, and were clipped"), "{}", ended.stderr);
+
     let seen = run(HOLOD, &["view", "--hologram", "hologram", "--focus", "2.5", "--out", "seen"], folder.path());
     assert!(seen.status.success(), "{seen:?}");
     let told = run(HOLOD, &[&args[..], &["--force", "--resolution", "64x40"]].concat(), folder.path());

@@ -116,6 +116,10 @@ fn a_pattern_on_a_panel_is_lit_by_each_fields_own_laser_or_stays_dark() {
     assert_eq!(green.stdout.matches(" fields, its laser without power").count(), 2, "{}", green.stdout);
     assert_eq!(green.stdout.matches(" of them lit").count(), 1, "{}", green.stdout);
 
+    let json = pattern(folder.path(), &rig(), "field-identity --output headless --duration 500ms --json");
+    let said: serde_json::Value = serde_json::from_str(&json.stdout).unwrap_or_else(|why| panic!("{why}: {json:?}"));
+    assert!(said["pattern"].is_string() && said["shown"]["lasers_dark"] == true, "{said}");
+    assert!(said["shown"]["lit"]["green"].as_u64().is_some_and(|lit| lit > 0), "{said}");
     let dark = pattern(folder.path(), &rig(), "field-identity --output headless --duration 500ms --dark");
     assert!(dark.status.success(), "{}", dark.stderr);
     assert_eq!(dark.stdout.matches(" fields, 0 of them lit").count(), 3, "{}", dark.stdout);

@@ -1,7 +1,10 @@
 //! What `holod render` says of its scene, and where what it made can be looked at.
 
+use std::ffi::OsStr;
 use std::fs;
+use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
+use std::process::Command;
 
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::LinearImage;
@@ -204,4 +207,61 @@ fn a_pupil_that_is_refused_is_not_said_to_be_shown_worse() {
     assert!(any.status.success(), "{any:?}");
     let worse = |stderr: &str| stderr.contains("the picture is worse");
     assert!(!worse(&named.stderr) && worse(&any.stderr), "{} {}", named.stderr, any.stderr);
+}
+
+#[test]
+fn what_a_colour_without_light_loses_is_not_told() {
+    let folder = holod_tests::new_folder();
+    let rig = small_rig(96, 64, "driver = \"simulated\"").replace("red = 1.9921875", "red = 0.8");
+    let only_green = rig.replace("mode = \"channel-packed\"", "mode = \"monochrome\"\ncolour = \"green\"");
+    let args = ["render", "--config", "rig.toml", "--pupil", "3", "--weights", "fast", "--backend", "cpu"];
+    let args = [&args[..], &["--out", "out", "--force", "--json"]].concat();
+    let loop_args = ["run", "--config", "rig.toml", "--pupil", "3", "--weights", "fast", "--backend", "cpu"];
+    let loop_args = [&loop_args[..], &["--output", "headless", "--frames", "2", "--json"]].concat();
+    for (text, is_told) in [(&rig, true), (&only_green, false)] {
+        fs::write(folder.path().join("rig.toml"), text).unwrap();
+        let ended = run(HOLOD, &args, folder.path());
+        assert!(ended.status.success(), "{ended:?}");
+        let report: Value = serde_json::from_str(&ended.stdout).unwrap();
+        assert_eq!(report["unreachable_share"].as_f64().unwrap() > 0.01, is_told, "{report}");
+        assert_eq!(ended.stderr.contains("red: the panel's stroke is 0.800 π"), is_told, "{}", ended.stderr);
+        let ended = run(HOLOD, &loop_args, folder.path());
+        assert!(ended.status.success(), "{ended:?}");
+        let summary: Value = serde_json::from_str(&ended.stdout).unwrap();
+        assert_eq!(summary["unreachable_share_max"].as_f64().unwrap() > 0.01, is_told, "{summary}");
+        assert_eq!(ended.stderr.contains("red: the panel's stroke is 0.800 π"), is_told, "{}", ended.stderr);
+    }
+}
+
+#[test]
+fn view_says_what_it_cannot_show_or_take() {
+    let folder = holod_tests::new_folder();
+    let dark = small_rig(96, 64, "driver = \"simulated\"").replace("= 1.0", "= 0.0");
+    fs::write(folder.path().join("dark.toml"), dark).unwrap();
+    let view = ["view", "--pupil", "3", "--focus", "1", "--weights", "fast", "--backend", "cpu", "--out", "seen.png"];
+    let ended = run(HOLOD, &[&view[..], &["--config", "dark.toml"]].concat(), folder.path());
+    assert!(ended.status.success() && ended.stderr.contains("the picture is black: the rig lights no"), "{ended:?}");
+
+    fs::create_dir(folder.path().join("r1")).unwrap();
+    fs::write(folder.path().join("r1/field.safetensors"), "").unwrap();
+    let args = ["view", "--hologram", "r1/field.safetensors", "--focus", "1", "--out", "other.png"];
+    let refused = run(HOLOD, &args, folder.path());
+    assert_eq!(refused.status.code(), Some(66));
+    assert!(refused.stderr.contains("found a file, expected the folder"), "{}", refused.stderr);
+    assert!(refused.stderr.contains("name the folder, such as r1"), "{}", refused.stderr);
+}
+
+#[test]
+fn view_prints_json_of_a_name_that_is_no_text() {
+    let folder = holod_tests::new_folder();
+    let args = ["view", "--pupil", "3", "--focus", "1", "--weights", "fast", "--backend", "cpu"];
+    let ended = Command::new(HOLOD)
+        .args([&args[..], &["--resolution", "48x48", "--json", "--out"]].concat())
+        .arg(OsStr::from_bytes(b"m\xfcller.png"))
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert!(ended.status.success(), "{ended:?}");
+    let report: Value = serde_json::from_slice(&ended.stdout).unwrap();
+    assert_eq!(report["out"], "m\u{fffd}ller.png");
 }

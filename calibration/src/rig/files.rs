@@ -17,6 +17,8 @@ pub(super) struct FileFault {
 
 /// Larger than any text file that belongs to a rig.
 pub(super) const TEXT_BYTES_MAX: u64 = 4 << 20;
+/// Larger than any picture of a panel.
+pub(super) const PICTURE_BYTES_MAX: u64 = 256 << 20;
 
 impl FileFault {
     /// `path` cannot be opened or read.
@@ -49,17 +51,26 @@ pub(super) fn plain_file(path: &Path) -> Result<u64, FileFault> {
     })
 }
 
-/// The text of a small file, without the byte-order mark that spreadsheets write before it.
-pub(super) fn read_text(path: &Path) -> Result<String, FileFault> {
+/// The bytes of a plain file that is a `kind` of at most `bytes_max`.
+pub(super) fn read_bytes(path: &Path, kind: &str, bytes_max: u64) -> Result<Vec<u8>, FileFault> {
     let length = plain_file(path)?;
-    if length > TEXT_BYTES_MAX {
+    if length > bytes_max {
         return Err(FileFault {
             found: format!("{}: {length} bytes", path.display()),
-            expected: format!("a text of at most {TEXT_BYTES_MAX} bytes"),
+            expected: format!("a {kind} of at most {bytes_max} bytes"),
             advice: "name the right file".into(),
         });
     }
-    let bytes = fs::read(path).map_err(|why| FileFault::unreadable(path, &why))?;
+    fs::read(path).map_err(|why| FileFault::unreadable(path, &why))
+}
+
+/// The text of a small file, without the byte-order mark that spreadsheets write before it.
+pub(super) fn read_text(path: &Path) -> Result<String, FileFault> {
+    text_of(read_bytes(path, "text", TEXT_BYTES_MAX)?, path)
+}
+
+/// The bytes of the file at `path` as text, without that mark.
+pub(super) fn text_of(bytes: Vec<u8>, path: &Path) -> Result<String, FileFault> {
     let mut text = String::from_utf8(bytes).map_err(|why| {
         let valid = why.utf8_error().valid_up_to();
         let line = 1 + why.as_bytes()[..valid].iter().filter(|&&b| b == b'\n').count();

@@ -1,13 +1,12 @@
 //! A picture of the phase that flattens a panel.
 
 use std::f64::consts::TAU;
-use std::fs::File;
-use std::io::BufReader;
+use std::io::Cursor;
 use std::path::Path;
 
 use image::{DynamicImage, ImageFormat, ImageReader};
 
-use super::files::{FileFault, plain_file};
+use super::files::FileFault;
 use crate::{Resolution, png_grey_bits};
 
 /// What the grays of a picture mean.
@@ -19,23 +18,22 @@ pub(super) struct GrayScale {
     pub(super) subtracted: bool,
 }
 
-/// Reads the phase in radians to add at each panel pixel, row-major.
+/// The phase in radians to add at each panel pixel, row-major, by the `picture` that the file at `path` holds.
 ///
-/// The picture is a PNG or BMP of the panel's size, recognised by its content: gray of 8 or 16 bits, or with a palette
+/// It is a PNG or BMP of the panel's size, recognised by its content: gray of 8 or 16 bits, or with a palette
 /// or colours that are all grays. Gray g is 2π·g/n; n is 256 or 65536, or the gray of 2π that `scale` states.
 ///
 /// # Errors
-/// [`FileFault`] where the file cannot be read, is neither format or damaged, has colours, transparency, grays of fewer
+/// [`FileFault`] where it is neither format or damaged, has colours, transparency, grays of fewer
 /// bits or another size than the panel, or fewer grays than `scale` says.
-pub(super) fn read(path: &Path, panel: Resolution, scale: GrayScale) -> Result<Vec<f32>, FileFault> {
-    plain_file(path)?;
+pub(super) fn read(path: &Path, picture: &[u8], panel: Resolution, scale: GrayScale) -> Result<Vec<f32>, FileFault> {
     let fault = |found: String, advice: &str| FileFault {
         found: format!("{}: {found}", path.display()),
         expected: format!("a gray PNG of 8 or 16 bits, or a BMP, {panel} pixels"),
         advice: advice.into(),
     };
     let damaged = |why: image::ImageError| fault(why.to_string(), "save it as a gray PNG or BMP again");
-    let (width, height) = open(path, &fault)?.into_dimensions().map_err(damaged)?;
+    let (width, height) = open(path, picture, &fault)?.into_dimensions().map_err(damaged)?;
     let size = Resolution { width: width as usize, height: height as usize };
     if size != panel {
         return Err(fault(
@@ -43,11 +41,11 @@ pub(super) fn read(path: &Path, panel: Resolution, scale: GrayScale) -> Result<V
             "make it at the panel's own size, or correct panel.width_px and height_px",
         ));
     }
-    let bits = png_grey_bits(path).map_err(|why| FileFault::unreadable(path, &why))?;
+    let bits = png_grey_bits(picture).map_err(|why| FileFault::unreadable(path, &why))?;
     if let Some(bits) = bits.filter(|bits| *bits < 8) {
         return Err(fault(format!("grays of {bits} bits"), "save it with 8 or 16 bits, as its grays were measured"));
     }
-    let picture = open(path, &fault)?.decode().map_err(damaged)?;
+    let picture = open(path, picture, &fault)?.decode().map_err(damaged)?;
     let (grays, full_range) = match picture {
         DynamicImage::ImageLuma8(gray) => (gray.into_raw().into_iter().map(f64::from).collect(), 256.0),
         DynamicImage::ImageLuma16(gray) => (gray.into_raw().into_iter().map(f64::from).collect(), 65536.0),
@@ -78,10 +76,13 @@ pub(super) fn read(path: &Path, panel: Resolution, scale: GrayScale) -> Result<V
 }
 
 /// The file as a picture of one of the two formats.
-fn open(path: &Path, fault: &impl Fn(String, &str) -> FileFault) -> Result<ImageReader<BufReader<File>>, FileFault> {
-    let unreadable = |why| FileFault::unreadable(path, &why);
-    let file = BufReader::new(File::open(path).map_err(unreadable)?);
-    let reader = ImageReader::new(file).with_guessed_format().map_err(unreadable)?;
+fn open<'a>(
+    path: &Path,
+    picture: &'a [u8],
+    fault: &impl Fn(String, &str) -> FileFault,
+) -> Result<ImageReader<Cursor<&'a [u8]>>, FileFault> {
+    let reader = ImageReader::new(Cursor::new(picture)).with_guessed_format();
+    let reader = reader.map_err(|why| FileFault::unreadable(path, &why))?;
     match reader.format() {
         Some(ImageFormat::Png | ImageFormat::Bmp) => Ok(reader),
         _ => Err(fault("neither PNG nor BMP".into(), "save it as a gray PNG or BMP")),

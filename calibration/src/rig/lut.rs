@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 use std::path::Path;
 
 use super::LevelPhase;
-use super::files::{FileFault, read_text};
+use super::files::FileFault;
 
 /// Rows that are quoted when several are wrong.
 const ROWS_QUOTED_MAX: usize = 3;
@@ -15,20 +15,19 @@ const OTHER_DEPTH_MIN: usize = 64;
 /// A panel of one level shows nothing.
 const LEVELS_MIN: usize = 2;
 
-/// Reads the phase in radians at levels of a panel that has `2^bit_depth` of them.
+/// The phase in radians at levels of a panel that has `2^bit_depth` of them, by the `text` of the file at `path`.
 ///
-/// The file is CSV, with an optional header line and `#` comments, in one of two forms:
+/// It is CSV, with an optional header line and `#` comments, in one of two forms:
 /// - every level: a row for each from 0 up, `level,phase_rad` or `phase_rad` alone. The phase may rise or fall with the
 ///   level but not both.
 /// - some levels, for a panel with few and irregular ones: a row `level,phase_rad` for each that may be used, the
 ///   levels rising, the phases in any order.
 ///
 /// # Errors
-/// [`FileFault`] where the file cannot be read, has a row that is no number or out of order, has too few or too many
+/// [`FileFault`] where it has a row that is no number or out of order, has too few or too many
 /// rows, or names every level and is not monotonic.
-pub(super) fn read(path: &Path, bit_depth: u8) -> Result<Vec<LevelPhase>, FileFault> {
+pub(super) fn read(path: &Path, text: &str, bit_depth: u8) -> Result<Vec<LevelPhase>, FileFault> {
     let levels = 1usize << bit_depth;
-    let text = read_text(path)?;
     let mut table: Vec<LevelPhase> = Vec::new();
     let mut all_named = true;
     let mut wrong = Vec::new();

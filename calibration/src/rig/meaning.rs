@@ -326,10 +326,18 @@ impl Rig {
     /// What a run, too, should say of the rig's figures before it shows anything: phases that cannot be shown, and
     /// figures that are likely to be in another unit.
     pub fn warnings(&self) -> Vec<String> {
-        let mut warnings = self.panel.warnings();
+        let mut warnings = self.panel_warnings();
         warnings.extend(self.times_in_seconds());
         warnings.extend(self.lasers.powers_in_watts());
         warnings
+    }
+
+    /// What of [`Self::warnings`] is in whatever the panel shows: phases and levels that it does without, in colours
+    /// that are lit.
+    pub fn panel_warnings(&self) -> Vec<String> {
+        let light = self.light();
+        let lit: Vec<Colour> = Colour::ALL.into_iter().filter(|&colour| light[colour] > 0.0).collect();
+        self.panel.warnings(&lit)
     }
 
     /// Times of a field that are so short that they would also fit into it if they were in seconds.
@@ -376,12 +384,12 @@ impl Lasers {
 }
 
 impl Panel {
-    /// What of [`Rig::warnings`] is in whatever the panel shows: phases and levels that it does without.
-    pub fn warnings(&self) -> Vec<String> {
-        let mut warnings = self.short_strokes();
-        warnings.extend(self.long_strokes());
+    /// Phases and levels that the panel does without in these colours.
+    fn warnings(&self, colours: &[Colour]) -> Vec<String> {
+        let mut warnings = self.short_strokes(colours);
+        warnings.extend(self.long_strokes(colours));
         let levels = 1usize << self.bit_depth;
-        let tables = self.lut.iter().filter_map(|(colour, table)| Some((colour, table.as_ref()?.len())));
+        let tables = colours.iter().filter_map(|&colour| Some((colour, self.lut[colour].as_ref()?.len())));
         warnings.extend(tables.filter(|(_, named)| *named < levels).map(|(colour, named)| {
             format!("{colour}: of {levels} levels only the {named} in the table are used; none is put between them")
         }));
@@ -406,13 +414,11 @@ impl Panel {
         steps.fold([0.0; 2], |[gap, step], next| [gap.max(next), step.max(next.min(gap))])
     }
 
-    /// For each colour whose stroke is much more than 2π, how few levels that leaves.
-    fn long_strokes(&self) -> Vec<String> {
+    /// For each of `colours` whose stroke is much more than 2π, how few levels that leaves.
+    fn long_strokes(&self, colours: &[Colour]) -> Vec<String> {
         let levels = 1u32 << self.bit_depth;
-        let long = self
-            .stroke_rad
-            .iter()
-            .filter(|&(colour, stroke_rad)| self.lut[colour].is_none() && *stroke_rad > LONG_STROKE_RAD);
+        let strokes = colours.iter().map(|&colour| (colour, self.stroke_rad[colour]));
+        let long = strokes.filter(|&(colour, stroke_rad)| self.lut[colour].is_none() && stroke_rad > LONG_STROKE_RAD);
         // All of them would be radians, and hardly any panel has less than half a wave.
         let may_be_radians = self.stroke_rad.0.iter().all(|stroke_rad| stroke_rad / PI >= PI);
         let told = long.map(|(colour, stroke_rad)| {
@@ -430,9 +436,9 @@ impl Panel {
         told.collect()
     }
 
-    /// For each colour whose levels leave a gap on the circle, what becomes of the phases that cannot be shown.
-    fn short_strokes(&self) -> Vec<String> {
-        let told = Colour::ALL.into_iter().filter_map(|colour| {
+    /// For each of `colours` whose levels leave a gap on the circle, what becomes of the phases that cannot be shown.
+    fn short_strokes(&self, colours: &[Colour]) -> Vec<String> {
+        let told = colours.iter().filter_map(|&colour| {
             let [gap_rad, step_rad] = self.gap_and_step(colour);
             // The top level of a 2π panel stands one step short of 2π.
             if gap_rad <= 1.5 * step_rad {
@@ -462,9 +468,9 @@ fn rounded(figure: f64) -> f64 {
 
 fn active_files(rig: &Rig) -> Vec<ActiveFile> {
     let kinds = [("lut", &rig.provenance.lut_files), ("flatness", &rig.provenance.flatness_files)];
-    let files = kinds.into_iter().flat_map(|(kind, paths)| {
-        paths.iter().filter_map(move |(colour, path)| {
-            Some(ActiveFile { kind: kind.into(), colour: colour.name().into(), path: path.clone()? })
+    let files = kinds.into_iter().flat_map(|(kind, files)| {
+        files.iter().filter_map(move |(colour, file)| {
+            Some(ActiveFile { kind: kind.into(), colour: colour.name().into(), path: file.as_ref()?.path.clone() })
         })
     });
     files.collect()

@@ -63,11 +63,20 @@ pub struct Provenance {
     /// The panel profile that the rig file names.
     pub panel_profile: Option<&'static str>,
     /// The file behind each table of [`Panel::lut`].
-    pub lut_files: PerColour<Option<PathBuf>>,
+    pub lut_files: PerColour<Option<TableFile>>,
     /// The file behind each picture of [`Panel::flatness_rad`].
-    pub flatness_files: PerColour<Option<PathBuf>>,
+    pub flatness_files: PerColour<Option<TableFile>>,
     /// The file behind the profile of lasers that take commands in text.
     pub laser_profile_file: Option<PathBuf>,
+}
+
+/// A file of measurements that a rig file names.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TableFile {
+    /// Where it is.
+    pub path: PathBuf,
+    /// XXH3 of 64 bits of its bytes as they were read.
+    pub xxh3: u64,
 }
 
 impl Provenance {

@@ -4,13 +4,16 @@ use std::collections::BTreeSet;
 use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
-use super::files::{plain_file, read_text};
+use twox_hash::XxHash3_64;
+
+use super::files::{PICTURE_BYTES_MAX, TEXT_BYTES_MAX, plain_file, read_bytes, read_text, text_of};
 use super::flatness::GrayScale;
 use super::profile::PanelProfile;
 use super::reader::{Found, Reader, Section, Span};
 use super::{
     Eye, LaserDriver, Lasers, LevelPhase, Model, Orientation, OutOfStroke, Packing, Panel, PanelMode, PhaseSign,
-    Provenance, Rig, RigError, SpecReader, TextLaserProfile, Tracker, VideoMargins, WeightsChoice, flatness, lut,
+    Provenance, Rig, RigError, SpecReader, TableFile, TextLaserProfile, Tracker, VideoMargins, WeightsChoice, flatness,
+    lut,
 };
 use crate::toml_source::Fault;
 use crate::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
@@ -473,20 +476,31 @@ fn read_phase<'a>(
         if let (Some(path), Some((bit_depth, _))) = (lut_paths[colour], levels) {
             let key = format!("lut_file.{colour}");
             let file = folder.join(path.value);
-            lut[colour] = reader.of_file(panel, &key, path.line, lut::read(&file, bit_depth));
+            let read = read_bytes(&file, "text", TEXT_BYTES_MAX).and_then(|bytes| {
+                let xxh3 = XxHash3_64::oneshot(&bytes);
+                Ok((lut::read(&file, &text_of(bytes, &file)?, bit_depth)?, xxh3))
+            });
+            let read = reader.of_file(panel, &key, path.line, read);
+            let (table, xxh3) = read.unzip();
+            lut[colour] = table;
             if let Some(table) = &lut[colour] {
                 let range = table_range(table);
                 check_lut(reader, panel, &key, path.line, range, sign.map(|sign| sign.value), stroke_pi[colour]);
                 stroke_rad[colour] = Some(range.either().abs());
             }
-            provenance.lut_files[colour] = Some(file);
+            provenance.lut_files[colour] = xxh3.map(|xxh3| TableFile { path: file, xxh3 });
         }
         if let (Some(path), Some(resolution)) = (flatness_paths[colour], resolution) {
             let file = folder.join(path.value);
             let gray_of_2pi = grays_of_2pi[colour].map(|gray| gray.value);
-            let read = flatness::read(&file, resolution, GrayScale { gray_of_2pi, subtracted });
-            flatness_rad[colour] = reader.of_file(panel, &format!("flatness_file.{colour}"), path.line, read);
-            provenance.flatness_files[colour] = Some(file);
+            let read = read_bytes(&file, "picture", PICTURE_BYTES_MAX).and_then(|bytes| {
+                let scale = GrayScale { gray_of_2pi, subtracted };
+                Ok((flatness::read(&file, &bytes, resolution, scale)?, XxHash3_64::oneshot(&bytes)))
+            });
+            let read = reader.of_file(panel, &format!("flatness_file.{colour}"), path.line, read);
+            let (picture, xxh3) = read.unzip();
+            flatness_rad[colour] = picture;
+            provenance.flatness_files[colour] = xxh3.map(|xxh3| TableFile { path: file, xxh3 });
         }
         if let (None, Some(gray)) = (flatness_paths[colour], grays_of_2pi[colour]) {
             let advice = format!("name {colour}'s picture in flatness_file, or take this out");

@@ -124,10 +124,10 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
     }
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let weights = setup::weights(&rig)?;
-    let named = SceneArgs { resolution: Some(args.resolution), ..SceneArgs::default() };
+    let named = SceneArgs { resolution: args.resolution, ..SceneArgs::default() };
     let frames = scene::frames(&named, &rig.geometry)?;
     let laps = progress::during("timing frames", || Laps::run(args, &rig, &weights, &frames.frames[0]))?;
-    let mut report = laps.report(args.resolution.to_string(), setup::weights_name(&rig.model.weights));
+    let mut report = laps.report(frames.resolution().to_string(), setup::weights_name(&rig.model.weights));
     if !args.duration.is_zero() {
         report.closed_loop = Some(closed_loop(args, rig, weights, frames)?);
     }
@@ -189,7 +189,7 @@ impl FeedReport {
 
 impl Laps {
     fn run(args: &BenchArgs, rig: &Rig, weights: &Weights, frame: &Arc<RgbdFrame>) -> Result<Self, Failure> {
-        let encoder = renderer::panel_encoder(rig, args.resolution)?;
+        let encoder = renderer::panel_encoder(rig, frame.resolution)?;
         let mut renderer = renderer::open(args.backend, weights, rig, &encoder, &renderer::Use::Command)?;
         let threads = renderer.cpu_threads();
         let mut levels = LevelsFrame::new(encoder.layout());

@@ -33,6 +33,7 @@ struct Report {
     width_px: usize,
     height_px: usize,
     amplitude_constant: f32,
+    /// Of colours that are lit.
     clipped_share: f32,
     /// Of all images.
     colour_clipped_px: usize,
@@ -85,15 +86,20 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     let computing = Instant::now();
     let clipped_share = progress::during(&format!("computing the hologram of {resolution}"), || {
         engine.render(&stack, &mut hologram).map_err(at_fault)?;
+        renderer::check_numbers(&hologram)?;
         Ok::<_, Failure>(double_phase.encode(&hologram, &mut pattern).clipped_share)
     })?;
+    let clipped_share = renderer::mean_where_lit(clipped_share, rig.light());
+    if let Some(fault) = renderer::clipping_fault(clipped_share) {
+        tracing::warn!("{fault}");
+    }
     let frame_ms = computing.elapsed().as_secs_f64() * 1e3;
     let optics = BenchOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
     let made_for = Some(RigHash::of(&rig.provenance));
     let stored = StoredHologram { hologram, pupil: stack.pupil, optics, amplitude_constant, rig: made_for };
     save(&stored, &pattern, &staging)?;
     let report = Report {
-        made_with: MadeWith::of(rig)?,
+        made_with: MadeWith::of(rig, &weights),
         phase_png_2pi: files::PHASE_LEVELS,
         pupil_mm: stack.pupil.mm(),
         focus_dpt: stack.focuses.iter().map(|&Dioptres(focus_dpt)| focus_dpt).collect(),

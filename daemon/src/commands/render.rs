@@ -33,8 +33,9 @@ pub(super) struct Report {
     pub(super) width_px: usize,
     pub(super) height_px: usize,
     pub(super) amplitude_constant: f32,
+    /// Of colours that are lit.
     clipped_share: f32,
-    /// Of the colour that has most, the share of phases that the panel has no level near.
+    /// Of the lit colour that has most, the share of phases that the panel has no level near.
     unreachable_share: f32,
     depth_missing_px: usize,
     depth_clamped_far_px: usize,
@@ -141,21 +142,23 @@ pub(super) fn compute(
         renderer.render(&frames.frames[0], pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))
     })?;
     let frame_ms = began.elapsed().as_secs_f64() * 1e3;
-    if let Some(fault) = renderer::clipping_fault(rendered.clipped_share) {
+    let clipped_share = rendered.clipped_where_lit(rig.light());
+    if let Some(fault) = renderer::clipping_fault(clipped_share) {
         tracing::warn!("{fault}");
     }
+    renderer::check_numbers(renderer.hologram().map_err(Failure::because(Exit::Unavailable))?)?;
     let done = &frames.reports[0];
     let [depth_least_dpt, depth_greatest_dpt] = done.depth_range.map(|depth| rig.geometry.depth_at(f64::from(depth)).0);
     let report = Report {
-        made_with: MadeWith::of(rig)?,
+        made_with: MadeWith::of(rig, &weights),
         phase_png_2pi: files::PHASE_LEVELS,
         scene: frames.name.clone(),
         pupil_mm: pupil.mm(),
         width_px: resolution.width,
         height_px: resolution.height,
         amplitude_constant: weights.config().amplitude_constant,
-        clipped_share: rendered.clipped_share,
-        unreachable_share: rendered.unreachable_share.0.into_iter().fold(0.0, f32::max),
+        clipped_share,
+        unreachable_share: rendered.unreachable_where_lit(rig.light()),
         depth_missing_px: done.depth_missing_px,
         depth_clamped_far_px: done.depth_clamped_far_px,
         depth_clamped_near_px: done.depth_clamped_near_px,

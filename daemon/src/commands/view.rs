@@ -17,10 +17,12 @@ use crate::cli::{Backend, SceneArgs, ViewArgs};
 use crate::destination::Destination;
 use crate::failure::{Exit, Failure, is_file};
 use crate::pictures::shown_pattern;
+use crate::staging::folder_of;
 use crate::{progress, renderer, results, setup};
 
 #[derive(Serialize)]
 struct Report<'a> {
+    #[serde(serialize_with = "results::path_text")]
     out: &'a Path,
     hologram_pupil_mm: f32,
     eye_pupil_mm: f32,
@@ -69,6 +71,11 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
             ));
         }
     };
+    if rig.light() == PerColour([0.0; 3]) {
+        tracing::warn!(
+            "the picture is black: the rig lights no colour that its panel shows; give lasers.power_mw of one more than 0"
+        );
+    }
     let LookedAt { pattern, pupil, optics, amplitude_constant } = looked_at;
     let resolution = pattern.resolution;
     let geometry = optics.geometry(resolution);
@@ -102,6 +109,14 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
 
 fn load(folder: &Path) -> Result<StoredHologram, Failure> {
     let path = folder.join("field.safetensors");
+    if is_file(folder)? {
+        let what = format!(
+            "--hologram {}: found a file, expected the folder that `holod render` wrote; name the folder, such as {}",
+            folder.display(),
+            folder_of(folder).display()
+        );
+        return Err(Failure::new(Exit::NoInput, what));
+    }
     if !is_file(&path)? {
         return Err(Failure::new(
             Exit::NoInput,

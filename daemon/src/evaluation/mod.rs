@@ -251,6 +251,7 @@ impl Judge {
         let unavailable = Failure::because(Exit::Unavailable);
         self.renderer.render(frame, pupil, &mut self.levels).map_err(&unavailable)?;
         let hologram = self.renderer.hologram().map_err(&unavailable)?;
+        renderer::check_numbers(hologram)?;
         let largest = self.amplitude_constant * self.amplitude_constant;
         let clipped = |&colour: &Colour| hologram.plane(colour).iter().filter(|a| a.norm_sqr() > largest).count();
         let clipped = self.colours.iter().map(clipped).sum::<usize>();

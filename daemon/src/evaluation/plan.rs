@@ -213,7 +213,7 @@ impl<'a> EvaluationPlan<'a> {
         let EvaluationSettings { rig, scenes, cards, marks, limit, .. } = settings;
         let colours = lit_colours(rig)?;
         let weights = setup::weights(rig)?;
-        let made_with = MadeWith::of(rig)?;
+        let made_with = MadeWith::of(rig, &weights);
         let shards = open(scenes, limit, rig)?;
         shards.iter().try_for_each(refuse_special)?;
         let cards = cards.map(|folder| open(folder, None, rig)).transpose()?.unwrap_or_default();

@@ -5,7 +5,7 @@ use std::hash::Hasher;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{Rig, WeightsChoice};
+use holod_calibration::rig::{Rig, TableFile, WeightsChoice};
 use holod_calibration::{Colour, DisplayGeometry};
 use holod_model::scene::{DepthEncoding, Fit, Scene};
 use serde::{Deserialize, Serialize};
@@ -272,7 +272,7 @@ pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Res
             ("lut_file", TABLES[0], &rig.provenance.lut_files),
             ("flatness_file", TABLES[1], &rig.provenance.flatness_files),
         ] {
-            if let Some(path) = &files[colour] {
+            if let Some(TableFile { path, .. }) = &files[colour] {
                 document["panel"][key][colour.name()] = keep(path, format!("{what}{colour}{}", extension(path)))?;
             }
         }

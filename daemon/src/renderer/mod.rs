@@ -83,12 +83,33 @@ pub trait Renderer: Send {
 /// What was lost between hologram and levels, and how it was computed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Rendered {
-    /// Share of samples whose amplitude exceeded the double phase's constant, 0..=1.
-    pub clipped_share: f32,
+    /// Share of each colour's samples whose amplitude exceeded the double phase's constant, 0..=1.
+    pub clipped_share: PerColour<f32>,
     /// Share of each colour's pixels whose phase the panel cannot reach, 0..=1.
     pub unreachable_share: PerColour<f32>,
     /// Whether another engine had to take the place of one that failed: its description is another one now.
     pub engine_changed: bool,
+}
+
+impl Rendered {
+    /// Share of samples that were clipped, of all colours that have some of `light`: [`Rig::light`].
+    pub fn clipped_where_lit(&self, light: PerColour<f32>) -> f32 {
+        mean_where_lit(self.clipped_share, light)
+    }
+
+    /// Share of pixels whose phase the panel cannot reach, of the colour among these that has most.
+    pub(crate) fn unreachable_where_lit(&self, light: PerColour<f32>) -> f32 {
+        where_lit(self.unreachable_share, light).fold(0.0, f32::max)
+    }
+}
+
+/// Mean of the shares of the colours that have some of `light`; 0 where none has.
+pub(crate) fn mean_where_lit(share: PerColour<f32>, light: PerColour<f32>) -> f32 {
+    where_lit(share, light).sum::<f32>() / where_lit(share, light).count().max(1) as f32
+}
+
+fn where_lit(share: PerColour<f32>, light: PerColour<f32>) -> impl Iterator<Item = f32> {
+    share.0.into_iter().zip(light.0).filter(|(_, light)| *light > 0.0).map(|(share, _)| share)
 }
 
 /// A renderer of frames of the pattern's size of `encoder`, on the optics of `rig`, and on the GPU that it names, if it
@@ -198,6 +219,56 @@ pub(crate) fn clipping_fault(clipped_share: f32) -> Option<String> {
             100.0 * clipped_share
         )
     })
+}
+
+/// Refuses a hologram that is no numbers: double phase would make darkness of it.
+///
+/// # Errors
+/// A value is not finite.
+pub(crate) fn check_numbers(hologram: &ComplexHologram) -> Result<(), Failure> {
+    let no_numbers = hologram.field.iter().filter(|value| !value.is_finite()).count();
+    if no_numbers == 0 {
+        return Ok(());
+    }
+    let values = hologram.field.len();
+    let what = format!(
+        "{no_numbers} of the hologram's {values} values are no finite numbers: the weights diverged in training, or \
+         overflow in half precision; try --backend cpu, which computes in single precision, or take other weights"
+    );
+    Err(Failure::new(Exit::Data, what))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_lost_in_colours_without_light_does_not_count() {
+        let (clipped_share, unreachable_share) = (PerColour([0.5, 0.1, 0.3]), PerColour([0.6, 0.1, 0.2]));
+        let rendered = Rendered { clipped_share, unreachable_share, engine_changed: false };
+        for (light, clipped, unreachable) in [
+            ([1.0, 1.0, 1.0], 0.3, 0.6),
+            ([0.0, 1.0, 1.0], 0.2, 0.2),
+            ([0.0, 1.0, 0.0], 0.1, 0.1),
+            ([0.0, 0.0, 0.0], 0.0, 0.0),
+        ] {
+            let light = PerColour(light);
+            assert!((rendered.clipped_where_lit(light) - clipped).abs() < 1e-6, "{light:?}");
+            assert_eq!(rendered.unreachable_where_lit(light), unreachable, "{light:?}");
+        }
+    }
+
+    #[test]
+    fn a_hologram_of_no_numbers_is_refused_with_a_cure() {
+        let mut hologram = ComplexHologram::dark(Resolution { width: 4, height: 3 });
+        check_numbers(&hologram).unwrap();
+        hologram.field[7].re = f32::NAN;
+        hologram.field[35].im = f32::INFINITY;
+        let refused = check_numbers(&hologram).unwrap_err();
+        assert_eq!(refused.exit, Exit::Data);
+        let says = "2 of the hologram's 36 values are no finite numbers: the weights diverged";
+        assert!(refused.to_string().starts_with(says) && refused.to_string().contains("--backend cpu"), "{refused}");
+    }
 }
 
 /// A renderer whose engines fail on command.

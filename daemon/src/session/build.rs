@@ -200,6 +200,7 @@ pub(super) fn build(
         renderer,
         port: output.frames,
         pacer: Pacer::new(pacing, host_now()),
+        light: rig.light(),
         trained: TrainedPupils::of(plan.weights.trained_pupils(&rig.geometry)),
         pattern: None,
         orders: FrameOrders::default(),

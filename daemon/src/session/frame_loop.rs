@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{PerColour, TimeNs};
 use holod_model::engine::EngineError;
 use holod_slm_output::{FramePlan, FramePort, LevelsFrame, Pacer};
 
@@ -32,6 +32,8 @@ pub(super) struct FrameLoop {
     pub port: FramePort,
     /// Which refresh each frame is for.
     pub pacer: Pacer,
+    /// The light of each colour: of those without any it matters to nobody what was lost.
+    pub light: PerColour<f32>,
     /// The pupils that the network knows.
     pub trained: TrainedPupils,
     /// Levels that take the place of what would be computed.
@@ -167,8 +169,8 @@ impl FrameLoop {
             },
             t_picture_in_hand,
             beyond_trained: !self.trained.contain(pupil.pupil),
-            clipped_share: rendered.clipped_share,
-            unreachable_share: rendered.unreachable_share.0.into_iter().fold(0.0, f32::max),
+            clipped_share: rendered.clipped_where_lit(self.light),
+            unreachable_share: rendered.unreachable_where_lit(self.light),
         };
         // A full ring means that nobody records; the frame is shown all the same.
         if self.records.push(record).is_err() {

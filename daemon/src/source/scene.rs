@@ -17,8 +17,9 @@ pub const SAMPLE_RESOLUTION: Resolution = Resolution { width: 512, height: 512 }
 const CLIPPED_SHARE_MAX: f64 = 0.01;
 
 /// What is said of a file whose colours are of other primaries.
-const FOREIGN_PRIMARIES: &str = "its `chromaticities` are not those of Rec. 709, as which its colours are shown: convert \
-                                 the picture to linear light with the primaries and the white of sRGB";
+const FOREIGN_PRIMARIES: &str = "it names other primaries than those of sRGB (Rec. 709), or a high dynamic range, but its \
+                                 colours are shown as sRGB's: convert the picture to sRGB, an OpenEXR file to linear \
+                                 light with the primaries and the white of sRGB";
 
 /// Frames of a sequence that are kept in memory, in bytes.
 const SEQUENCE_BYTES_MAX: u64 = 4 << 30;

@@ -2,7 +2,7 @@
 
 use std::f32::consts::TAU;
 
-use holod_calibration::Resolution;
+use holod_calibration::{PerColour, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
@@ -62,8 +62,8 @@ struct PairErrors {
 /// What one encoding lost.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DoublePhaseReport {
-    /// Share of samples whose amplitude exceeded the constant, 0..=1.
-    pub clipped_share: f32,
+    /// Share of each colour's samples whose amplitude exceeded the constant, 0..=1.
+    pub clipped_share: PerColour<f32>,
 }
 
 impl DoublePhase {
@@ -103,8 +103,11 @@ impl DoublePhase {
         );
         let planes =
             hologram.field.chunks_exact(self.clipped.len()).zip(pattern.phase_rad.chunks_exact_mut(self.clipped.len()));
-        let clipped = planes.map(|(field, phase_rad)| self.encode_plane(field, phase_rad)).sum::<u64>();
-        DoublePhaseReport { clipped_share: (clipped as f64 / pattern.phase_rad.len().max(1) as f64) as f32 }
+        let mut clipped_share = PerColour([0.0; 3]);
+        for (share, (field, phase_rad)) in clipped_share.0.iter_mut().zip(planes) {
+            *share = (self.encode_plane(field, phase_rad) as f64 / field.len() as f64) as f32;
+        }
+        DoublePhaseReport { clipped_share }
     }
 
     /// Encodes one colour, and says how many of its samples were clipped.
@@ -461,16 +464,17 @@ mod tests {
             encoded(&hologram, constant)
         };
         let (dark, nothing_clipped) = one(Complex32::ZERO, 1.0);
-        assert_eq!(nothing_clipped.clipped_share, 0.0);
+        assert_eq!(nothing_clipped.clipped_share, PerColour([0.0; 3]));
         assert!((dark.phase_rad[1] - FRAC_PI_2).abs() < 1e-6);
-        assert_eq!(one(Complex32::new(1.0, 0.0), 1.0).1.clipped_share, 0.0);
+        assert_eq!(one(Complex32::new(1.0, 0.0), 1.0).1.clipped_share, PerColour([0.0; 3]));
         let clipped = one(Complex32::new(0.0, 1.1), 1.0);
-        assert!((clipped.1.clipped_share - 1.0 / 36.0).abs() < 1e-6);
+        let [red, green, blue] = clipped.1.clipped_share.0;
+        assert!((red - 1.0 / 12.0).abs() < 1e-6 && [green, blue] == [0.0; 2], "{red} {green} {blue}");
         assert_eq!(clipped.0, one(Complex32::new(0.0, 1e9), 1.0).0, "what exceeds the constant counts as it");
         assert_ne!(clipped.0, dark);
         for (re, im) in [(f32::NAN, 0.0), (f32::INFINITY, 0.0), (f32::INFINITY, f32::NAN), (1e30, 0.0)] {
             let (pattern, report) = one(Complex32::new(re, im), 1.0);
-            assert!(pattern == dark && report.clipped_share > 0.0, "{re} {im}");
+            assert!(pattern == dark && report.clipped_share[Colour::Red] > 0.0, "{re} {im}");
         }
     }
 
@@ -551,8 +555,9 @@ mod tests {
                 let worst = worst_phasor(found, &expected);
                 // At an amplitude of 1 a rounding of 1e-7 turns a phasor by 5e-4.
                 assert!(worst < 1e-3, "{worst} of {resolution} on {}", set.name());
-                let samples = hologram.field.len() as f64;
-                assert_eq!((f64::from(clipped_share) * samples).round() as usize, above, "on {}", set.name());
+                let samples = resolution.pixels() as f64;
+                let clipped = clipped_share.0.into_iter().map(f64::from).sum::<f64>() * samples;
+                assert_eq!(clipped.round() as usize, above, "on {}", set.name());
                 let judged = || (0..expected.len()).filter(|&place| expected[place].norm() > 0.05);
                 for place in [judged().next().unwrap(), judged().next_back().unwrap()] {
                     let right = found[place];

@@ -24,7 +24,7 @@ pub(super) struct ColourRaster {
     pub(super) clipped: ClippedColours,
     /// Whether one channel of luminance stands for all colours.
     pub(super) is_luminance: bool,
-    /// Whether the file names other primaries than Rec. 709's.
+    /// Whether the file names other primaries than Rec. 709's, or a high dynamic range.
     pub(super) has_foreign_primaries: bool,
 }
 

@@ -30,6 +30,7 @@ mod focal_stack;
 mod jpeg;
 mod live;
 mod openexr;
+mod primaries;
 mod raster;
 
 use std::fmt;

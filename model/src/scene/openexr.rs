@@ -15,7 +15,7 @@ use image::metadata::Orientation;
 
 use super::decoded::{ColourRaster, DepthRaster, FORMATS, MOST_PIXELS, check_size};
 use super::depth::DepthNumbers;
-use super::{ClippedColours, SceneError, clipped};
+use super::{ClippedColours, SceneError, clipped, primaries};
 
 /// A decoded file.
 struct Picture {
@@ -69,10 +69,7 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
 
 /// Whether colours are of the primaries and the white of sRGB.
 fn are_rec709(Chromaticities { red, green, blue, white }: Chromaticities) -> bool {
-    const REC709: [[f32; 2]; 4] = [[0.64, 0.33], [0.30, 0.60], [0.15, 0.06], [0.3127, 0.3290]];
-    let alike = |found: f32, expected: f32| (found - expected).abs() <= 1e-3;
-    let all = [red, green, blue, white].into_iter().zip(REC709);
-    all.into_iter().all(|(found, [x, y])| alike(found.x(), x) && alike(found.y(), y))
+    primaries::are_rec709([red, green, blue, white].map(|point| [point.x(), point.y()]))
 }
 
 pub(super) fn read_depth(path: &Path, is_alone: bool) -> Result<DepthRaster, SceneError> {

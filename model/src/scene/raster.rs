@@ -10,7 +10,7 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
 
 use super::decoded::{ColourRaster, DepthRaster, FORMATS, check_size};
 use super::depth::DepthNumbers;
-use super::{ClippedColours, SceneError, jpeg, openexr};
+use super::{ClippedColours, SceneError, jpeg, openexr, primaries};
 use crate::picture::srgb_to_linear;
 
 /// What kind of file a path holds, by its first bytes.
@@ -24,15 +24,18 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
     match format_of(path)? {
         Format::OpenExr => openexr::read_colour(path),
         Format::Other => {
-            let (picture, turned) = decode(path)?;
+            let (picture, turned, icc_profile) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
+            let are_foreign = |file| primaries::are_foreign(BufReader::new(file), icc_profile.as_deref());
+            let has_foreign_primaries = picture.color().has_color()
+                && File::open(path).and_then(are_foreign).map_err(|source| read_error(path, source))?;
             Ok(ColourRaster {
                 size,
                 turned,
                 linear: linear_planes(&picture),
                 clipped: ClippedColours::default(),
                 is_luminance: false,
-                has_foreign_primaries: false,
+                has_foreign_primaries,
             })
         }
     }
@@ -43,9 +46,9 @@ pub(super) fn read_depth(path: &Path, is_alone: bool) -> Result<DepthRaster, Sce
     match format_of(path)? {
         Format::OpenExr => openexr::read_depth(path, is_alone),
         Format::Other => {
-            let (picture, turned) = decode(path)?;
+            let (picture, turned, _) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
-            let bits = png_grey_bits(path).map_err(|source| read_error(path, source))?;
+            let bits = File::open(path).and_then(png_grey_bits).map_err(|source| read_error(path, source))?;
             let mut numbers = depth_numbers(path, picture)?;
             if let Some(bits @ ..8) = bits {
                 numbers.shrink_to(bits);
@@ -77,8 +80,8 @@ fn format_of(path: &Path) -> Result<Format, SceneError> {
     Ok(if magic == [0x76, 0x2f, 0x31, 0x01] { Format::OpenExr } else { Format::Other })
 }
 
-/// The picture as viewers show it, and how its file says that it is turned for that.
-fn decode(path: &Path) -> Result<(DynamicImage, Orientation), SceneError> {
+/// The picture as viewers show it, how its file says that it is turned for that, and its ICC profile.
+fn decode(path: &Path) -> Result<(DynamicImage, Orientation, Option<Vec<u8>>), SceneError> {
     let damaged = |found: String| SceneError::Picture {
         path: path.to_owned(),
         found,
@@ -107,9 +110,11 @@ fn decode(path: &Path) -> Result<(DynamicImage, Orientation), SceneError> {
     let (width, height) = decoder.dimensions();
     check_size(path, width as usize, height as usize)?;
     let turned = decoder.orientation().map_err(damaged)?;
+    // One that cannot be read keeps no picture from being shown.
+    let icc_profile = decoder.icc_profile().unwrap_or_default();
     let mut picture = DynamicImage::from_decoder(decoder).map_err(damaged)?;
     picture.apply_orientation(turned);
-    Ok((picture, turned))
+    Ok((picture, turned, icc_profile))
 }
 
 /// Linear light of each colour; transparent pixels over black.

@@ -512,6 +512,75 @@ fn primaries_that_are_not_rec_709s_are_reported() {
 }
 
 #[test]
+fn other_colours_than_srgbs_of_png_and_jpeg_are_reported() {
+    use image::ImageEncoder;
+    use image::codecs::jpeg::JpegEncoder;
+    use image::codecs::png::PngEncoder;
+    let files = Files::new();
+    let profile = |colours: [[f32; 3]; 3]| {
+        let mut bytes = vec![0; 128];
+        bytes.extend(3_u32.to_be_bytes());
+        for (index, name) in [b"rXYZ", b"gXYZ", b"bXYZ"].into_iter().enumerate() {
+            bytes.extend(
+                name.iter().copied().chain((168 + 20 * index as u32).to_be_bytes()).chain(20_u32.to_be_bytes()),
+            );
+        }
+        for colour in colours {
+            bytes.extend(b"XYZ \0\0\0\0");
+            bytes.extend(colour.iter().flat_map(|part| ((part * 65536.0) as i32).to_be_bytes()));
+        }
+        bytes
+    };
+    let srgb = profile([[0.43607, 0.22249, 0.01392], [0.38515, 0.71687, 0.09708], [0.14307, 0.06061, 0.7141]]);
+    let p3 = profile([[0.51512, 0.2412, -0.00105], [0.29198, 0.69225, 0.04189], [0.1571, 0.06657, 0.78407]]);
+    let with_profile = |profile: &[u8], is_png: bool| {
+        let mut bytes = Vec::new();
+        let (pixels, kind) = ([90; 12], image::ExtendedColorType::Rgb8);
+        if is_png {
+            let mut encoder = PngEncoder::new(&mut bytes);
+            encoder.set_icc_profile(profile.to_vec()).unwrap();
+            encoder.write_image(&pixels, 2, 2, kind).unwrap();
+        } else {
+            let mut encoder = JpegEncoder::new(&mut bytes);
+            encoder.set_icc_profile(profile.to_vec()).unwrap();
+            encoder.write_image(&pixels, 2, 2, kind).unwrap();
+        }
+        bytes
+    };
+    let is_told = |bytes: &[u8]| {
+        std::fs::write(files.path("c.png"), bytes).unwrap();
+        raster::read_colour(&files.path("c.png")).unwrap().has_foreign_primaries
+    };
+    for is_png in [false, true] {
+        assert!(!is_told(&with_profile(&srgb, is_png)));
+        assert!(is_told(&with_profile(&p3, is_png)));
+        assert!(!is_told(&with_profile(&p3[..140], is_png)), "a profile that is cut says nothing");
+    }
+
+    files.colour8("plain.png", 2, 2, |_, _| [90, 60, 30]);
+    let plain = std::fs::read(files.path("plain.png")).unwrap();
+    let with_chunks = |chunks: &[(&[u8; 4], Vec<u8>)]| {
+        let mut bytes = plain[..33].to_vec();
+        for (name, content) in chunks {
+            let named = [&name[..], content].concat();
+            let sum = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&named);
+            bytes.extend((content.len() as u32).to_be_bytes().into_iter().chain(named).chain(sum.to_be_bytes()));
+        }
+        bytes.extend(&plain[33..]);
+        is_told(&bytes)
+    };
+    let points = |points: [u32; 8]| (b"cHRM", points.into_iter().flat_map(u32::to_be_bytes).collect::<Vec<u8>>());
+    let rec709 = || points([31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000]);
+    let rec2020 = || points([31270, 32900, 70800, 29200, 17000, 79700, 13100, 4600]);
+    let codes = |primaries, transfer| (b"cICP", vec![primaries, transfer, 0, 1]);
+    assert!(!with_chunks(&[]) && !with_chunks(&[rec709()]) && !with_chunks(&[codes(1, 13)]));
+    assert!(with_chunks(&[rec2020()]) && with_chunks(&[codes(9, 13)]));
+    assert!(with_chunks(&[codes(1, 16)]) && with_chunks(&[codes(1, 18)]), "PQ and HLG");
+    assert!(!with_chunks(&[(b"sRGB", vec![0]), rec2020()]), "sRGB stands above cHRM");
+    assert!(with_chunks(&[codes(12, 13), rec709()]), "cICP stands above it, too");
+}
+
+#[test]
 fn a_depth_file_of_its_own_may_be_grey_or_have_one_channel_of_any_name() {
     let files = Files::new();
     let path = files.path("d.exr");

@@ -13,6 +13,7 @@ use std::path::Path;
 
 use holod_calibration::{DisplayGeometry, PupilDiameter};
 use safetensors::SafeTensors;
+use twox_hash::XxHash3_64;
 
 use self::metadata::Metadata;
 use self::tensors::TensorReader;
@@ -35,6 +36,7 @@ pub struct Weights {
     pub(crate) family: Family,
     metrics: serde_json::Value,
     provenance: serde_json::Value,
+    file_xxh3: Option<u64>,
 }
 
 impl Weights {
@@ -64,7 +66,9 @@ impl Weights {
             let found = if metadata.is_file() { format!("{} bytes", metadata.len()) } else { "no regular file".into() };
             return Err(WeightsError::NotAFile { path: path.to_owned(), found });
         }
-        Self::from_bytes(&std::fs::read(path).map_err(read_error)?, &path.display().to_string())
+        let bytes = std::fs::read(path).map_err(read_error)?;
+        let weights = Self::from_bytes(&bytes, &path.display().to_string())?;
+        Ok(Self { file_xxh3: Some(XxHash3_64::oneshot(&bytes)), ..weights })
     }
 
     /// Checks weights in memory; `name` says in errors which they are.
@@ -81,7 +85,13 @@ impl Weights {
         let file = TensorReader { name, tensors };
         let number = |tensor: &str| Ok(file.tensor(tensor, &[1])?[0]);
         let family = Family::read(&config, |shape| file.layer(shape), number)?;
-        Ok(Self { config, family, metrics: metadata.remark("metrics"), provenance: metadata.remark("provenance") })
+        let (metrics, provenance) = (metadata.remark("metrics"), metadata.remark("provenance"));
+        Ok(Self { config, family, metrics, provenance, file_xxh3: None })
+    }
+
+    /// XXH3 of 64 bits of the file's bytes as [`Self::load`] read them; none of weights in memory.
+    pub fn file_xxh3(&self) -> Option<u64> {
+        self.file_xxh3
     }
 
     /// What network this is and what it was trained for.

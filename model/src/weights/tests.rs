@@ -44,7 +44,7 @@ pub(crate) fn random_weights(config: NetworkConfig, seed: u64) -> Weights {
     };
     let number = |name: &str| Ok(if name == SHARPNESS { 1.3 } else { 0.6 });
     let family = Family::read(&config, layer, number).unwrap();
-    Weights { config, family, metrics: serde_json::Value::Null, provenance: serde_json::Value::Null }
+    Weights { config, family, metrics: serde_json::Value::Null, provenance: serde_json::Value::Null, file_xxh3: None }
 }
 
 /// The tensors of `weights` under the names and shapes of the file format.

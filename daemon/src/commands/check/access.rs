@@ -130,7 +130,8 @@ pub(in crate::commands) fn files_of(rig: &Rig) -> Vec<PathBuf> {
         WeightsChoice::File(path) => Some(path.clone()),
         _ => None,
     };
-    let tables = provenance.lut_files.0.iter().chain(&provenance.flatness_files.0).flatten().cloned();
+    let tables = provenance.lut_files.0.iter().chain(&provenance.flatness_files.0).flatten();
+    let tables = tables.map(|table| table.path.clone());
     let lasers = provenance.laser_profile_file.clone();
     let tracker = rig.tracker.spec.as_ref().and_then(|spec| spec.parse::<TrackerSpec>().ok());
     let tracker = tracker.map(|spec| spec.files()).unwrap_or_default();

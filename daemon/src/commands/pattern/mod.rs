@@ -8,7 +8,9 @@ use std::path::{Path, PathBuf};
 use holod_calibration::Colour;
 use holod_slm_output::patterns::{Pattern, Placement};
 use holod_slm_output::{FrameLayout, LevelsFrame, OutputSpec, PanelEncoder};
+use serde::Serialize;
 
+use self::show::Shown;
 use self::sight::Sight;
 use crate::cli::{PatternKind, PatternTarget};
 use crate::failure::{Exit, Failure};
@@ -16,6 +18,15 @@ use crate::overwriting::refuse_existing;
 use crate::pictures::video_pictures;
 use crate::session::{NO_ACKNOWLEDGEMENT, not_dark};
 use crate::{results, setup};
+
+/// What `--json` prints, once the pattern is no longer shown.
+#[derive(Serialize)]
+struct Report<'a> {
+    #[serde(flatten)]
+    sight: &'a Sight,
+    /// Nothing without `--output`.
+    shown: Option<&'a Shown>,
+}
 
 pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> {
     let to = kind.target();
@@ -34,18 +45,22 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
     if let Some(out) = &to.out {
         sight.files = save(&levels, out, to.force)?;
     }
-    if to.json {
-        results::print_json(&sight)?;
-    } else {
+    if !to.json {
         results::print(sight.to_string().trim_end())?;
     }
-    let Some(output) = output else { return Ok(()) };
+    let Some(output) = output else {
+        return if to.json { results::print_json(&Report { sight: &sight, shown: None }) } else { Ok(()) };
+    };
     if to.rig.config.is_none() && !matches!(output, OutputSpec::Headless(_)) {
         tracing::warn!("no --config: this is the built-in rig's panel and optics, and it lights no lasers");
     }
     let lit = show::rig_with_lasers_of(rig, &placement);
     let shown = show::show(&output, &lit, &encoder, &levels, to)?;
-    results::print(&shown.to_string())?;
+    if to.json {
+        results::print_json(&Report { sight: &sight, shown: Some(&shown) })?;
+    } else {
+        results::print(&shown.to_string())?;
+    }
     match shown.lasers_dark {
         true => Ok(()),
         false => Err(Failure::new(Exit::Unavailable, not_dark(NO_ACKNOWLEDGEMENT))),

@@ -11,6 +11,7 @@ use holod_slm_output::output::{OutputError, pacing_config};
 use holod_slm_output::patterns::Placement;
 use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, PanelEncoder, PanelEvent};
+use serde::{Serialize, Serializer};
 
 use crate::cli::PatternTarget;
 use crate::failure::{Exit, Failure};
@@ -23,17 +24,22 @@ const FIRST_COPY: TimeNs = TimeNs(5_000_000);
 const LONGEST_SLEEP: TimeNs = TimeNs(20_000_000);
 
 /// What came of showing a pattern.
-#[derive(Default)]
+#[derive(Default, Serialize)]
 pub(super) struct Shown {
     ended_by: String,
     duration_s: f64,
     refresh_hz: f64,
+    #[serde(serialize_with = "by_colour")]
     fields: PerColour<u64>,
+    #[serde(serialize_with = "by_colour")]
     lit: PerColour<u64>,
     /// Fields of lasers that are simply on while their box is armed.
+    #[serde(serialize_with = "by_colour")]
     not_told: PerColour<u64>,
+    #[serde(skip)]
     has_power: PerColour<bool>,
     /// Why the last field that was not lit was not.
+    #[serde(serialize_with = "in_words")]
     dark: Option<DarkReason>,
     pub(super) lasers_dark: bool,
     flat_presented: bool,
@@ -46,6 +52,14 @@ pub(super) fn rig_with_lasers_of(mut rig: Rig, placement: &Placement) -> Rig {
         rig.lasers.power_mw[colour] = 0.0;
     }
     rig
+}
+
+fn by_colour<S: Serializer>(counts: &PerColour<u64>, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_map(counts.iter().map(|(colour, count)| (colour.name(), count)))
+}
+
+fn in_words<S: Serializer>(reason: &Option<DarkReason>, serializer: S) -> Result<S::Ok, S::Error> {
+    reason.map(|reason| reason.to_string()).serialize(serializer)
 }
 
 /// Shows `levels` on the panel that `spec` names until the asked time is over or a signal comes; lasers are dark when

@@ -3,7 +3,7 @@
 
 @group(0) @binding(0) var<storage, read> field: array<vec2f>; // [3, height, width]
 @group(0) @binding(1) var<storage, read_write> errors: array<vec2f>; // [3, height, width]
-@group(0) @binding(2) var<storage, read_write> clipped_samples: atomic<u32>;
+@group(0) @binding(2) var<storage, read_write> clipped_samples: array<atomic<u32>, 3>;
 @group(0) @binding(3) var<storage, read_write> phases_rad: array<f32>; // [3, height, width]
 
 // Edge of the blocks of a thread, in pixels.
@@ -66,7 +66,7 @@ fn pair_errors(@builtin(workgroup_id) tile: vec3u, @builtin(local_invocation_ind
         tile_power += powers[other];
     }
     if thread == 0u && atomicLoad(&outside) > 0u {
-        atomicAdd(&clipped_samples, atomicLoad(&outside));
+        atomicAdd(&clipped_samples[tile.z], atomicLoad(&outside));
     }
     let dark = clamp(DARK_SHARE * sqrt(tile_power / f32(TILE * TILE)), LEAST_DARK, MOST_DARK);
     let floor = dark * dark * dark;

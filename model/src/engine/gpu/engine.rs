@@ -36,8 +36,8 @@ pub struct GpuEngine {
 /// What was lost between hologram and levels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct EncodedCounts {
-    /// Samples of the hologram whose amplitude exceeded the double phase's constant.
-    pub clipped: u32,
+    /// Of each colour, samples of the hologram whose amplitude exceeded the double phase's constant.
+    pub clipped: [u32; 3],
     /// Of each colour, pixels whose phase the panel cannot reach.
     pub unreachable: [u32; 3],
 }
@@ -57,7 +57,7 @@ struct Readback {
 }
 
 /// Bytes of the counts.
-const COUNTS_BYTES: u64 = 16;
+const COUNTS_BYTES: u64 = 24;
 const TIMESTAMP_BYTES: u64 = 8;
 
 impl GpuEngine {
@@ -227,8 +227,8 @@ impl GpuEngine {
             encoder.resolve_query_set(queries, 0..2 * timings.stages.len() as u32, resolved, 0);
             encoder.copy_buffer_to_buffer(resolved, 0, staging, 0, *timestamps_bytes);
         }
-        encoder.copy_buffer_to_buffer(clipped, 0, staging, *timestamps_bytes, 4);
-        encoder.copy_buffer_to_buffer(unreachable, 0, staging, *timestamps_bytes + 4, 12);
+        encoder.copy_buffer_to_buffer(clipped, 0, staging, *timestamps_bytes, 12);
+        encoder.copy_buffer_to_buffer(unreachable, 0, staging, *timestamps_bytes + 12, 12);
         let place = *timestamps_bytes + COUNTS_BYTES;
         encoder.copy_buffer_to_buffer(loaded.buffer(network.samples), 0, staging, place, *samples_bytes);
         gpu.queue.submit([encoder.finish()])
@@ -247,8 +247,8 @@ impl GpuEngine {
         let written: &[u16] = bytemuck::cast_slice(written);
         assert_eq!(samples.len().next_multiple_of(2), written.len(), "the samples of one panel");
         samples.copy_from_slice(&written[..samples.len()]);
-        let counts: &[u32] = bytemuck::cast_slice(counts);
-        let counts = EncodedCounts { clipped: counts[0], unreachable: [counts[1], counts[2], counts[3]] };
+        let counts: [[u32; 3]; 2] = bytemuck::pod_read_unaligned(counts);
+        let counts = EncodedCounts { clipped: counts[0], unreachable: counts[1] };
         if let Some(Timestamps { tick_ns, .. }) = timestamps {
             let ticks: &[u64] = bytemuck::cast_slice(ticks);
             for (timing, ticks) in timings.stages.iter_mut().zip(ticks.chunks_exact(2)) {

@@ -26,7 +26,7 @@ pub(crate) struct NetworkPlan {
     pub(super) phases: BufferId,
     /// The panel's samples, two to 32 bits.
     pub(super) samples: BufferId,
-    /// How many samples were clipped, and how many are out of the panel's reach in each colour: zero before a frame.
+    /// How many samples of each colour were clipped, and how many are out of the panel's reach: zero before a frame.
     pub(super) clipped: BufferId,
     pub(super) unreachable: BufferId,
 }
@@ -81,7 +81,7 @@ impl NetworkPlan {
             }
             Family::FocalStack { .. } => return Err(EngineError::takes_focal_stacks()),
         }
-        let clipped = plan.buffer::<u32>("clipped samples", 1);
+        let clipped = plan.buffer::<u32>("clipped samples", 3);
         let unreachable = plan.buffer::<u32>("samples out of reach", 3);
         let phases = double_phase::encode(&mut plan, &shared, config.amplitude_constant, clipped);
         let samples = levels::encode(&mut plan, tables, phases, unreachable);

@@ -59,17 +59,18 @@ fn phase_error(actual: &[f32], expected: &[f32], tolerance_rad: f32) -> (f32, us
     })
 }
 
-/// Phases and count of clipped samples, on the device.
-fn encoded_on_gpu(hologram: &ComplexHologram, constant: f32) -> (Vec<f32>, u32) {
+/// Phases, and each colour's count of clipped samples, on the device.
+fn encoded_on_gpu(hologram: &ComplexHologram, constant: f32) -> (Vec<f32>, [u32; 3]) {
     let mut plan = Plan::default();
     let shared = Shared::new(&mut plan, hologram.resolution, hologram.resolution);
-    let clipped = plan.buffer::<u32>("clipped samples", 1);
+    let clipped = plan.buffer::<u32>("clipped samples", 3);
     let phases = double_phase::encode(&mut plan, &shared, constant, clipped);
     let trial = Trial::new(&plan);
     let parts: Vec<f32> = hologram.field.iter().flat_map(|value| [value.re, value.im]).collect();
     trial.write(shared.field, &parts);
     trial.run();
-    (trial.read(phases), trial.read(clipped)[0].to_bits())
+    let counts = trial.read(clipped);
+    (trial.read(phases), [0, 1, 2].map(|colour| counts[colour].to_bits()))
 }
 
 #[test]
@@ -80,8 +81,10 @@ fn double_phase_is_the_processors() {
         let mut pattern = PhasePattern::flat(hologram.resolution);
         let report = DoublePhase::new(hologram.resolution, 1.25).encode(&hologram, &mut pattern);
         let (phases_rad, clipped) = encoded_on_gpu(&hologram, 1.25);
-        let share = clipped as f32 / phases_rad.len() as f32;
-        assert!((share - report.clipped_share).abs() < 1e-6, "{width}x{height}: {share} of {}", report.clipped_share);
+        for (count, share) in clipped.into_iter().zip(report.clipped_share.0) {
+            let found = count as f32 / hologram.resolution.pixels() as f32;
+            assert!((found - share).abs() < 1e-6, "{width}x{height}: {found} of {share}");
+        }
         assert!(phases_rad.iter().all(|phase| (0.0..TAU).contains(phase)));
         // Where a corrected phasor is nearly 0 its phase is anything.
         let (worst, count) = phase_error(&phases_rad, &pattern.phase_rad, TOLERANCE_RAD);
