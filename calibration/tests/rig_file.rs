@@ -1312,6 +1312,14 @@ fn a_gpu_may_be_named() {
     assert_eq!(named.model.gpu.as_deref(), Some("RTX 4090"));
     assert_eq!(named.differences(&plain), ["model.gpu"]);
     check("network = \"standard\"", "gpu = \"\"", "model.gpu", "an empty text", "a part of a GPU's name", "");
+    check(
+        "network = \"standard\"",
+        r#"gpu = "R\u0000""#,
+        "model.gpu",
+        "a NUL",
+        "a part of a GPU's name",
+        "take that out",
+    );
 }
 
 #[test]

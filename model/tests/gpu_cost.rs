@@ -13,13 +13,12 @@ fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// The costs of all networks on both cards, with the least share of multiply-adds that a hot loop of products may have.
+/// The costs of the frames that are asked for, with the least share of multiply-adds that a hot loop of products may have.
 /// The program's exit code is not 0 where a register spills or a shader does not compile.
-fn judge_frames(more: &[&str], least_share: f64) -> Vec<f64> {
-    let output = gpu_cost().arg("--json").args(more).output().expect("it starts");
+fn judge_frames(asked: &[&str], least_share: f64) -> Vec<f64> {
+    let output = gpu_cost().arg("--json").args(asked).output().expect("it starts");
     assert!(output.status.success(), "{}", said(&output));
     let frames: Vec<Value> = serde_json::from_slice(&output.stdout).expect("JSON");
-    assert!(frames.len() >= 6 && frames.len().is_multiple_of(6), "three networks on two cards");
     let judge = |frame: &Value| {
         let mut seconds = 0.0;
         for stage in frame["stages"].as_array().expect("stages") {
@@ -44,30 +43,21 @@ fn judge_frames(more: &[&str], least_share: f64) -> Vec<f64> {
 }
 
 #[test]
-fn no_shader_spills_and_what_convolves_multiplies_and_adds() {
-    let size = ["--resolution", "1920x1080"];
-    let half = [&size[..], &["--half-precision"]].concat();
-    let (single, half) = thread::scope(|scope| {
-        scope.spawn(|| judge_frames(&[], 0.87));
-        let single = scope.spawn(|| judge_frames(&size, 0.87));
-        let half = judge_frames(&half, 0.75);
-        (single.join().expect("its frames are as they should be"), half)
+fn no_shader_spills_what_convolves_multiplies_and_adds_and_costs_follow_pixels_and_cards() {
+    let half = ["--resolution", "1920x1080", "--half-precision"];
+    let asked: [(&[&str], f64); 3] =
+        [(&["--card", "rx-7900-xtx"], 0.87), (&["--card", "rx-6800-xt"], 0.87), (&half, 0.75)];
+    let [fast, slow, half] = thread::scope(|scope| {
+        let judged = asked.map(|(asked, share)| scope.spawn(move || judge_frames(asked, share)));
+        judged.map(|judged| judged.join().expect("its frames are as they should be"))
     });
-    assert!(single.iter().zip(&half).all(|(single, half)| *half < 0.9 * single), "{single:?} {half:?}");
-}
-
-/// More pixels take longer, and so does the slower card.
-#[test]
-fn costs_follow_pixels_and_cards() {
-    let seconds = |card: &str, resolution: &str| {
-        let arguments = ["--json", "--network", "small", "--card", card, "--resolution", resolution];
-        let output = gpu_cost().args(arguments).output().expect("it starts");
-        let frames: Vec<Value> = serde_json::from_slice(&output.stdout).expect("JSON");
-        frames[0]["seconds"].as_f64().expect("seconds")
-    };
-    let fast = ["1920x1080", "3840x2160"].map(|resolution| seconds("rx-7900-xtx", resolution));
-    assert!(fast[1] > 3.5 * fast[0] && fast[1] < 4.5 * fast[0], "{fast:?}");
-    assert!(seconds("rx-6800-xt", "1920x1080") > 1.2 * fast[0]);
+    assert_eq!([fast.len(), slow.len(), half.len()], [9, 9, 6], "three networks, of three sizes or on two cards");
+    let single = fast.chunks(3).chain(slow.chunks(3));
+    assert!(single.zip(&half).all(|(single, half)| *half < 0.9 * single[1]), "{fast:?} {slow:?} {half:?}");
+    for (fast, slow) in fast.chunks(3).zip(slow.chunks(3)) {
+        assert!(fast[2] > 3.5 * fast[1] && fast[2] < 4.5 * fast[1], "{fast:?}");
+        assert!(slow[1] > 1.2 * fast[1], "{slow:?} {fast:?}");
+    }
 }
 
 #[test]

@@ -303,16 +303,11 @@ impl Renderer {
 }
 
 pub(crate) fn backend_named(name: &str) -> PyResult<Backend> {
-    match name {
-        "auto" => Ok(Backend::Auto),
-        "cpu" => Ok(Backend::Cpu),
-        "cpu-half" => Ok(Backend::CpuHalf),
-        "gpu" => Ok(Backend::Gpu),
-        "gpu-half" => Ok(Backend::GpuHalf),
-        _ => Err(InputError::new_err(format!(
+    serde_json::from_value(name.into()).map_err(|_| {
+        InputError::new_err(format!(
             "backend: found {name:?}, expected \"auto\", \"cpu\", \"cpu-half\", \"gpu\" or \"gpu-half\""
-        ))),
-    }
+        ))
+    })
 }
 
 /// The hologram of one picture for one pupil. Arrays of three are red, green, blue.

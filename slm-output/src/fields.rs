@@ -80,16 +80,6 @@ impl FrameLayout {
         self.field_order.iter().position(|&shown| shown == colour).expect("a field order holds each colour once")
     }
 
-    /// Red, green and blue of a video pixel of a channel-packed frame, of whose fields `shown` are the levels in the
-    /// order in which they are shown.
-    pub fn channels_of(&self, shown: [u16; FIELDS]) -> [u16; FIELDS] {
-        let mut channels = [0; FIELDS];
-        for (channel, level) in self.channel_order.into_iter().zip(shown) {
-            channels[channel.index()] = level;
-        }
-        channels
-    }
-
     /// Distance in samples between neighbouring pixels of one field.
     const fn stride(&self) -> usize {
         match self.mode {

@@ -501,7 +501,7 @@ fn identify(reader: UnixStream, writer: UnixStream, name: &str) -> Result<Serial
 fn real_lasers_stay_dark_over_a_virtual_panel() {
     let (reader, writer, served) = line_to(|far| lying_box(far, |text| text.replace(" simulated", " bench-4")));
     let laser = identify(reader, writer, "bench").unwrap();
-    assert!(!laser.is_simulated());
+    assert!(!laser.capability().simulated);
     let rig = Rig::default();
     let size = Resolution { width: 4, height: 2 };
     let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();

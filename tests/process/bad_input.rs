@@ -176,7 +176,9 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         Case { args: &["--no-such-option"], exit: 64, says: &["--no-such-option"] },
     ];
     for case in &cases {
-        let ended = run(HOLOD, case.args, folder.path());
+        // Before a tracker is opened a first frame is made.
+        let small: &[&str] = if case.args[0] == "--tracker" { &["--resolution", "64x64"] } else { &[] };
+        let ended = run(HOLOD, &[case.args, small].concat(), folder.path());
         let what = format!("holod {}\n{}", case.args.join(" "), ended.stderr);
         assert_eq!(ended.status.code(), Some(case.exit), "{what}");
         for words in case.says {
@@ -215,7 +217,7 @@ fn results_are_overwritten_by_force_only_and_by_the_same_rule_everywhere() {
         (vec!["pattern", "level", "37", "--config", "rig.toml", "--out", "level.png"], "level.png"),
         (with(&["run", "--tracker", "mock", "--frames", "2", "--record", "record"]), "record/frames.csv"),
         (
-            vec!["demo", "--duration", "8s", "--resolution", "128x128", "--weights", "small", "--out", "demo"],
+            vec!["demo", "--duration", "2s", "--resolution", "128x128", "--weights", "small", "--out", "demo"],
             "demo/eye.png",
         ),
     ];
@@ -231,9 +233,9 @@ fn results_are_overwritten_by_force_only_and_by_the_same_rule_everywhere() {
         assert_ne!(fs::read(at(result)).unwrap(), b"precious", "{args:?}");
     }
     // The demo finds a folder of its own each time.
-    for name in ["holod-demo", "holod-demo-2"] {
-        let ended =
-            run(HOLOD, &["demo", "--duration", "8s", "--resolution", "128x128", "--weights", "small"], folder.path());
+    for (name, duration) in [("holod-demo", "8s"), ("holod-demo-2", "2s")] {
+        let args = ["demo", "--duration", duration, "--resolution", "128x128", "--weights", "small"];
+        let ended = run(HOLOD, &args, folder.path());
         assert!(ended.status.success() && at(name).join("eye.png").is_file(), "{}", ended.stderr);
         assert!(ended.stdout.contains(name), "{}", ended.stdout);
     }
@@ -345,7 +347,7 @@ fn a_pipe_is_never_replaced_by_a_file() {
 fn a_pipe_is_no_log() {
     let folder = holod_tests::new_folder();
     rustix::fs::mkfifoat(rustix::fs::CWD, folder.path().join("pipe"), Mode::RUSR | Mode::WUSR).unwrap();
-    for args in [&["--tracker", "replay:pipe", "--frames", "1"][..], &["log", "info", "pipe"]] {
+    for args in [&["--tracker", "replay:pipe", "--resolution", "64x64"][..], &["log", "info", "pipe"]] {
         let ended = run(HOLOD, args, folder.path());
         assert!(ended.stderr.contains("a device or pipe"), "{args:?}: {ended:?}");
         assert!(!ended.status.success(), "{args:?}");
@@ -357,7 +359,7 @@ fn a_record_is_never_overwritten() {
     let folder = holod_tests::new_folder();
     fs::create_dir(folder.path().join("record")).unwrap();
     fs::write(folder.path().join("record/frames.csv"), "precious").unwrap();
-    let ended = run(HOLOD, &["--record", "record", "--frames", "1"], folder.path());
+    let ended = run(HOLOD, &["--record", "record", "--resolution", "64x64"], folder.path());
     assert_eq!(ended.status.code(), Some(73), "{}", ended.stderr);
     assert_eq!(fs::read_to_string(folder.path().join("record/frames.csv")).unwrap(), "precious");
 }

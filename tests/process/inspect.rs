@@ -470,7 +470,7 @@ fn the_log_says_more_when_asked_and_a_typo_silences_nothing() {
     let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let logged = |level: &str| {
-        let args = ["--config", "rig.toml", "--tracker", "mock", "--resolution", "64x64", "--duration", "3s"];
+        let args = ["--config", "rig.toml", "--tracker", "mock", "--resolution", "64x64", "--duration", "1s"];
         Daemon::start_with(HOLOD, &args, folder.path(), &[("HOLOD_LOG", Path::new(level))]).wait(PATIENCE).stderr
     };
     let count = |text: &str, level: &str| text.lines().filter(|line| line.contains(level)).count();

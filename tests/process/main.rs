@@ -22,3 +22,13 @@ mod sleep;
 mod tracker;
 
 const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+
+/// Tests each case, all at once: what takes long waits.
+fn beside_each_other<T: Send>(cases: impl IntoIterator<Item = T>, test: impl Fn(T) + Sync) {
+    let test = &test;
+    std::thread::scope(|scope| {
+        for case in cases {
+            scope.spawn(move || test(case));
+        }
+    });
+}

@@ -5,7 +5,7 @@ use std::fs;
 use holod_tests::daemon::{Ended, run};
 use holod_tests::small_rig;
 
-use crate::HOLOD;
+use crate::{HOLOD, beside_each_other};
 
 /// Runs for `duration` over `output`, with one field for each refresh where `sequential`; the end, and its summary.
 fn run_over(output: &str, sequential: bool, duration: &str) -> (Ended, serde_json::Value) {
@@ -32,19 +32,19 @@ fn count(summary: &serde_json::Value, name: &str) -> u64 {
 
 #[test]
 fn an_unplugged_panel_is_named_dark_and_taken_back() {
-    for sequential in [false, true] {
+    beside_each_other([false, true], |sequential| {
         let (ended, summary) = run_over("headless:unplug=1s+1s", sequential, "4s");
         assert!(ended.stderr.contains("the panel is lost, lasers dark: the panel was unplugged"), "{}", ended.stderr);
         assert!(ended.stderr.contains("the panel is back"), "{}", ended.stderr);
         let reasons = summary["lasers"]["went_dark"].to_string();
         assert!(reasons.contains("panel-lost") && reasons.contains("shutdown"), "dark twice: {reasons}");
         assert_eq!(summary["flat_at_end"], true);
-    }
+    });
 }
 
 #[test]
 fn a_panel_of_another_rate_stays_dark_and_both_rates_are_said() {
-    for (sequential, rate, nominal) in [(false, "57", "60"), (true, "150", "180")] {
+    beside_each_other([(false, "57", "60"), (true, "150", "180")], |(sequential, rate, nominal)| {
         let (ended, summary) = run_over(&format!("headless:refresh={rate}"), sequential, "3s");
         let said = format!("the panel refreshes at {rate}.00 Hz, the rig says {nominal} Hz");
         assert!(ended.stderr.contains(&said), "{}", ended.stderr);
@@ -52,26 +52,22 @@ fn a_panel_of_another_rate_stays_dark_and_both_rates_are_said() {
         assert_eq!(count(&summary, "lit"), 0);
         let measured_hz = summary["panel_refresh_hz"].as_f64().unwrap();
         assert!((measured_hz - rate.parse::<f64>().unwrap()).abs() < 0.01, "{measured_hz}");
-    }
+    });
 }
 
 #[test]
 fn a_panel_a_little_off_its_rate_is_lit_and_one_whose_reports_scatter_is_not_which_is_said() {
-    for output in ["headless:refresh=59.92", "headless:refresh=60.2"] {
+    beside_each_other(["headless:refresh=59.92", "headless:refresh=60.2"], |output| {
         let (ended, summary) = run_over(output, false, "3s");
         assert!(count(&summary, "lit") > 100, "{output}: {summary:#}");
         assert!(!ended.stderr.contains("is believed"), "{}", ended.stderr);
-    }
-    for sequential in [false, true] {
+    });
+    beside_each_other([false, true], |sequential| {
         let (ended, summary) = run_over("headless:jitter=0.3ms,seed=5", sequential, "6s");
         assert_eq!(count(&summary, "lit"), 0, "{summary:#}");
-        assert_eq!(
-            ended.stderr.matches("no report of the panel's refreshes is believed").count(),
-            1,
-            "{}",
-            ended.stderr
-        );
-    }
+        let told = ended.stderr.matches("no report of the panel's refreshes is believed").count();
+        assert_eq!(told, 1, "{}", ended.stderr);
+    });
 }
 
 /// As those of a compositor may be: each field's report comes when it has gone by.

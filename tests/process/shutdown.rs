@@ -17,7 +17,7 @@ use holod_tests::tracker::PtyTracker;
 use holod_tests::{FIELD_ORDER, frames, small_rig};
 use rustix::process::Signal;
 
-use crate::HOLOD;
+use crate::{HOLOD, beside_each_other};
 
 /// A laser box on a pseudo-terminal, outside the daemon's process, with a clock of its own, that logs what its lasers
 /// do.
@@ -307,7 +307,7 @@ fn lasers_that_did_not_acknowledge_are_told_again_after_later_starts_of_the_serv
 
 #[test]
 fn fields_are_dark_for_what_keeps_the_box_from_being_armed() {
-    for (reason, is_by_hand) in [("interlock", false), ("by-hand", true)] {
+    beside_each_other([("interlock", false), ("by-hand", true)], |(reason, is_by_hand)| {
         let laser_box = LaserBench::plug_in();
         let daemon = laser_box.lit_daemon();
         let holod = |args: &[&str]| run(HOLOD, args, laser_box.folder.path());
@@ -329,7 +329,7 @@ fn fields_are_dark_for_what_keeps_the_box_from_being_armed() {
         let count = |reason: &str| dark[reason].as_u64().unwrap_or(0);
         // Before the fault a busy machine may have been late.
         assert!(count(reason) > 300 && count("late") + count("box-fault") < count(reason) / 2, "{dark:#}");
-    }
+    });
 }
 
 #[test]

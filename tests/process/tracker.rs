@@ -248,10 +248,7 @@ fn unplugging_garbage_and_silence_are_survived_and_counted() {
 #[test]
 #[ignore = "needs shared data"]
 fn shared_data_neon_recording_through_a_port_holds_through_both_blinks() {
-    let shared = std::env::var("HOLOD_SHARED_DATA")
-        .map(PathBuf::from)
-        .unwrap_or_else(|_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"));
-    let log = shared.join("pupil/neon_demo/3d_eye_states.csv");
+    let log = holod_tests::shared_data().join("pupil/neon_demo/3d_eye_states.csv");
     let recording = Recording::read(&log).unwrap();
     let samples: Vec<PupilSample> = recording.samples().filter(|sample| sample.eye == SampleEye::Left).collect();
     let bench = Bench::new();

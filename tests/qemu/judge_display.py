@@ -18,6 +18,8 @@ INTERVAL_TOLERANCE_US = 100
 RUNS = {"flips": (1003, 7), "fields": (303, 21), "monochrome": (103, 7)}
 # Refreshes after the panel came back.
 AFTER_LOSS = 120
+# Where flips are not what is judged, a busy host may make the emulated machine late by one.
+MISSED_AFTER_LOSS = 1
 # Until the counter and times of flips have agreed three times.
 BEFORE_BELIEVED = 2
 CHECKS_READ_BACK = {
@@ -154,21 +156,24 @@ def mismatches(result: dict) -> list[str]:
         if found != expected:
             wrong.append(f"{what}: found {found}, expected {expected}")
 
-    def expect_clean(name: str, run: dict, refreshes: int, believed: int) -> None:
+    def expect_clean(name: str, run: dict, refreshes: int, believed: int, missed_most: int = 0) -> None:
         expect(f"{name}: exit", run["exit"], 0)
         expect(f"{name}: refreshes", run["refreshes"], refreshes)
         expect(f"{name}: before they are believed", run["before_believed"], BEFORE_BELIEVED)
         expect(f"{name}: hardware times", run["hardware"], believed)
         for fault in [
             "repeated",
-            "not_counted_on_by_one",
             "not_the_next_field_of_the_next_frame",
             "reported_before_their_time",
             "allocations_in_tick",
         ]:
             expect(f"{name}: {fault}", run[fault], 0)
-        for interval_us in run["interval_us"]:
-            if not abs(interval_us - PERIOD_US) <= INTERVAL_TOLERANCE_US:
+        missed = run["not_counted_on_by_one"]
+        if missed > missed_most:
+            wrong.append(f"{name}: not_counted_on_by_one: found {missed}, expected at most {missed_most}")
+        # One that is missed makes one interval of two refreshes.
+        for interval_us, expected_us in zip(run["interval_us"], [PERIOD_US, PERIOD_US * (1 + min(missed, 1))], strict=True):
+            if not abs(interval_us - expected_us) <= INTERVAL_TOLERANCE_US:
                 wrong.append(f"{name}: an interval of {interval_us} us")
 
     for name, (refreshes, patterns) in RUNS.items():
@@ -187,7 +192,7 @@ def mismatches(result: dict) -> list[str]:
             expect(f"{name}: {check}", checks.get(check), (found, "right"))
     for name, said in LOSSES.items():
         run = result[name]
-        expect_clean(name, run, AFTER_LOSS, AFTER_LOSS - BEFORE_BELIEVED)
+        expect_clean(name, run, AFTER_LOSS, AFTER_LOSS - BEFORE_BELIEVED, MISSED_AFTER_LOSS)
         expect(f"{name}: times that it came back", run["back"], 1)
         for word, words in {"lost": [said, LOST_AT_FIRST.get(name, said)], "not_yet": [said]}.items():
             if not any(said in run[word] for said in words):
@@ -196,7 +201,7 @@ def mismatches(result: dict) -> list[str]:
         expect(f"{name}: card opened by", opened_by(result[name]), "seat `seat0`")
     expect("not_seated: exit", result["not_seated"]["exit"], 0)
     expect("not_seated: card opened by", opened_by(result["not_seated"]), "holod itself")
-    expect_clean("terminal", result["terminal"], AFTER_LOSS, AFTER_LOSS - BEFORE_BELIEVED)
+    expect_clean("terminal", result["terminal"], AFTER_LOSS, AFTER_LOSS - BEFORE_BELIEVED, MISSED_AFTER_LOSS)
     expect("terminal: times that it came back", result["terminal"]["back"], 0)
     for name in SWITCHED:
         expect(f"{name}: terminals in front", result[f"terminals_of_{name}"]["terminals"], "tty2 tty1")
@@ -234,6 +239,7 @@ def right_run(refreshes: int) -> dict:
     return run
 
 
+MISSED_ONE = {"not_counted_on_by_one": 1, "interval_us": [16666, 33334]}
 RIGHT_HOLOGRAMS = ["a", "b", "c", "d", "e"]
 
 
@@ -274,7 +280,10 @@ def right_result() -> dict:
 
 def check_the_judge() -> list[str]:
     """The wrong results that were not refused."""
-    failures = [f"a right result was refused: {wrong}" for wrong in mismatches(right_result())]
+    once_late = right_result()
+    for section in [*LOSSES, "terminal"]:
+        once_late[section] |= MISSED_ONE
+    failures = [f"a right result was refused: {wrong}" for wrong in mismatches(right_result()) + mismatches(once_late)]
 
     def try_wrong(what: str, change) -> None:
         result = copy.deepcopy(right_result())
@@ -292,7 +301,9 @@ def check_the_judge() -> list[str]:
             try_wrong(f"{section} {key}", put(section, key, 1))
         for interval in [[16500, 16667], [16667, 33334]]:
             try_wrong(f"{section} interval", put(section, "interval_us", interval))
+        try_wrong(f"{section} two missed", lambda result, s=section: result[s].update(MISSED_ONE, not_counted_on_by_one=2))
     for section in RUNS:
+        try_wrong(f"{section} one missed", lambda result, s=section: result[s].update(MISSED_ONE))
         try_wrong(f"{section} wrong", put(section, "wrong", 1))
         for key, value in {"equal": 20, "different": 1, "patterns": 1}.items():
             try_wrong(f"{section} {key}", lambda result, s=section, k=key, v=value: result[s]["crc"].__setitem__(k, v))

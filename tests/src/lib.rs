@@ -6,6 +6,8 @@ pub mod feed;
 pub mod frames;
 pub mod tracker;
 
+use std::path::{Path, PathBuf};
+
 use rustix::fs::statvfs;
 use tempfile::TempDir;
 
@@ -18,6 +20,12 @@ pub fn new_folder() -> TempDir {
     let free_bytes = statvfs(MEMORY).map_or(0, |disk| disk.f_bavail * disk.f_frsize);
     let in_memory = (free_bytes > MEMORY_BYTES).then(|| tempfile::tempdir_in(MEMORY).ok()).flatten();
     in_memory.unwrap_or_else(|| tempfile::tempdir().expect("a temporary folder"))
+}
+
+/// The folder of the recordings and scenes outside the repository.
+pub fn shared_data() -> PathBuf {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
+    std::env::var_os("HOLOD_SHARED_DATA").map_or_else(beside, PathBuf::from)
 }
 
 const MEMORY: &str = "/dev/shm";

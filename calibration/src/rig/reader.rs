@@ -456,8 +456,12 @@ impl<'a> Reader<'a> {
             Some(text) if !text.trim().is_empty() && !text.contains('\0') => {
                 Some(Found { value: text, line: found.line })
             }
-            Some(_) => {
-                self.fault_in(section, key, found.line, "an empty text", expected, "fill it in or take it out".into());
+            Some(text) => {
+                let (is, advice) = match text.contains('\0') {
+                    true => ("a text with a NUL character", "take that out"),
+                    false => ("an empty text", "fill it in or take it out"),
+                };
+                self.fault_in(section, key, found.line, is, expected, advice.into());
                 None
             }
             None => {

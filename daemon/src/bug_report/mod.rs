@@ -7,8 +7,10 @@
 //! | `scrub` | takes names out of text |
 //! | `unpack` | takes a report apart, whoever made it |
 //! | `recorded` | reads which frames were made, and of what |
-//! | `play` | lets the loop make them again, and compares |
+//! | `play` | lets the loop make them again |
+//! | `comparison` | compares them |
 
+mod comparison;
 #[cfg(fuzzing)]
 pub mod fuzzing;
 mod pack;
@@ -22,8 +24,9 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
+pub use self::comparison::{Comparison, Outcome};
 pub use self::pack::{Contents, default_name};
-pub use self::play::{Comparison, Outcome, Played, prepare};
+pub use self::play::{Played, prepare};
 pub use self::scrub::Scrubber;
 pub use self::unpack::{Unpacked, is_archive, refuse_archive, unpack};
 use crate::machine::Machine;

@@ -8,6 +8,7 @@ use exr::math::Vec2;
 use exr::meta::attribute::{Chromaticities, IntegerBounds, Text};
 use exr::meta::header::{ImageAttributes, LayerAttributes};
 use exr::prelude::{Encoding, WritableImage};
+use holod_tests::shared_data;
 use image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
 
 use super::*;
@@ -764,11 +765,6 @@ fn encodings_are_read_from_a_command_line() {
         assert_eq!(error.contains("the near one, has no more dioptres than the first"), told, "{error}");
         assert!(error.contains("NEAR more than FAR; the rig's depth range where they are left out"), "{error}");
     }
-}
-
-fn shared_data() -> PathBuf {
-    std::env::var_os("HOLOD_SHARED_DATA")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), PathBuf::from)
 }
 
 #[test]

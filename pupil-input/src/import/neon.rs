@@ -41,13 +41,7 @@ fn recognises_cloud(input: &LogInput<'_>) -> bool {
 
 fn read_cloud(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let mut lines = input.lines()?;
-    let header = loop {
-        let Some(line) = lines.next(log) else { return Ok(()) };
-        if !line.bytes.trim_ascii().is_empty() {
-            break Header::of(line.bytes, separator(line.bytes));
-        }
-    };
-    lines.are_rows(header.separator, header.len());
+    let Some(header) = lines.header(log) else { return Ok(()) };
     let [left, right, both] = DIAMETERS.map(|(diameter, _, _)| header.column(diameter));
     let [lid_left, lid_right, lid_both] = DIAMETERS.map(|(_, aperture, _)| header.column(aperture));
     let there = [left, right, both].map(|column| column.is_some());

@@ -53,13 +53,7 @@ fn method(name: Option<&[u8]>, diameter_mm: Option<&[u8]>) -> Method {
 
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let mut lines = input.lines()?;
-    let header = loop {
-        let Some(line) = lines.next(log) else { return Ok(()) };
-        if !line.bytes.trim_ascii().is_empty() {
-            break Header::of(line.bytes, separator(line.bytes));
-        }
-    };
-    lines.are_rows(header.separator, header.len());
+    let Some(header) = lines.header(log) else { return Ok(()) };
     let columns = [
         header.first_of(&TIME),
         header.first_of(&EYE),

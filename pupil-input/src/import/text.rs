@@ -6,6 +6,7 @@ use holod_calibration::TimeNs;
 
 use super::fault::LogFault;
 use super::recording::LogBuilder;
+use super::table::separator;
 
 /// A longer line is no line of any log: it is counted as [`LogFault::TooLong`] and never held.
 pub(crate) const MAX_LINE_BYTES: usize = 1 << 16;
@@ -41,6 +42,18 @@ impl Lines {
     /// was cut off there, and that row is counted as malformed and not handed out.
     pub(crate) const fn are_rows(&mut self, separator: u8, columns: usize) {
         self.columns = Some((separator, columns));
+    }
+
+    /// The first line that is not blank, which names the columns of the rows to come.
+    pub(crate) fn header(&mut self, log: &mut LogBuilder) -> Option<Header> {
+        loop {
+            let line = self.next(log)?.bytes;
+            if !line.trim_ascii().is_empty() {
+                let header = Header::of(line, separator(line));
+                self.are_rows(header.separator, header.len());
+                return Some(header);
+            }
+        }
     }
 
     /// The next line, be it empty; overlong ones are counted in `log` and skipped. None at the end, or where reading

@@ -121,13 +121,6 @@ impl MockSource {
         Self { script, random, iris, ticks: [0; 2], t_last_arrival: TimeNs(i64::MIN) }
     }
 
-    /// The same with a tracker that tells lid apertures, 8 mm where the lids are open.
-    #[must_use]
-    pub const fn with_apertures(mut self) -> Self {
-        self.script.aperture_mm = Some(8.0);
-        self
-    }
-
     /// The same with a tracker that is always sure of itself.
     #[must_use]
     pub const fn without_confidence(mut self) -> Self {

@@ -4,7 +4,6 @@
 //! table of `doc/estimate.md`. The others live here only.
 
 use std::collections::VecDeque;
-use std::path::{Path, PathBuf};
 
 use crate::support::settings;
 use holod_calibration::{TimeNs, rig};
@@ -12,6 +11,7 @@ use holod_pupil_input::{
     Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Recording, SampleEye, Scenario,
     Script, Verdict,
 };
+use holod_tests::shared_data;
 
 /// Blur in pixels of the default bench for a millimetre of pupil, from one end of the depth range to the other: 2.857
 /// dioptres over 0.2 mrad a pixel.
@@ -273,11 +273,6 @@ fn the_judges_know_a_delayed_and_a_restless_display() {
     let restless: Vec<_> = (0..2000).map(|k| (k as f64 * 0.005, 4.0 + 0.1 * f64::from(k % 2))).collect();
     let (of_rms, of_peaks) = flicker_mm(&restless);
     assert!((of_rms - 0.05).abs() < 1e-6 && (of_peaks - 0.1).abs() < 1e-6);
-}
-
-fn shared_data() -> PathBuf {
-    let default = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    std::env::var_os("HOLOD_SHARED_DATA").map_or_else(default, PathBuf::from)
 }
 
 /// A real recording of both eyes, in millimetres. Diameters without a unit are made 4 mm in the median.

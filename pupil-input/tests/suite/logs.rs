@@ -12,7 +12,7 @@ use holod_pupil_input::{
     Blink, Estimator, LogFault, LogFormat, LogInfo, PupilSample, PupilState, Recording, ReplayError, SampleEye,
     SizeUnit, Verdict,
 };
-use proptest::prelude::*;
+use holod_tests::shared_data;
 use tempfile::TempDir;
 
 fn written(dir: &TempDir, name: &str, content: impl AsRef<[u8]>) -> PathBuf {
@@ -666,7 +666,7 @@ fn neon_of_the_phone_is_read_with_its_companions() {
 }
 
 /// An example of each format, short enough to be spoilt often.
-fn examples() -> Vec<Vec<u8>> {
+pub(crate) fn examples() -> Vec<Vec<u8>> {
     let short = |text: String| text.into_bytes()[..2500].to_vec();
     let (states, _) = made_up_logs::neon_native(200.0);
     vec![
@@ -677,47 +677,6 @@ fn examples() -> Vec<Vec<u8>> {
         short(made_up_logs::smi(60.0, ';', true)),
         states[..1600].to_vec(),
     ]
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig { cases: 96, ..ProptestConfig::default() })]
-
-    #[test]
-    fn no_spoilt_log_makes_an_importer_panic(
-        spoils in proptest::collection::vec((any::<u16>(), 0..4_u8, any::<u8>()), 0..12),
-        companion in any::<bool>(),
-    ) {
-        let dir = TempDir::new().expect("a folder");
-        for mut bytes in examples() {
-            for (at, how, value) in &spoils {
-                let at = usize::from(*at) % bytes.len();
-                let value = usize::from(*value);
-                match how {
-                    0 => bytes[at] = value as u8,
-                    1 => drop(bytes.drain(at..(at + value).min(bytes.len() - 1).max(at))),
-                    2 => {
-                        let odd: &[u8] = [&b"9999999999999999999"[..], b"-1e309\t.\t;,;\n\0nan"][value % 2];
-                        drop(bytes.splice(at..at, odd.iter().copied()));
-                    }
-                    _ => drop(bytes.splice(at..at, b"\n".repeat(value % 4))),
-                }
-            }
-            if companion {
-                written(&dir, "log.time", &bytes[..bytes.len() / 80 * 8]);
-            }
-            let path = written(&dir, "log", &bytes);
-            if let Ok(recording) = Recording::read(&path) {
-                let info = LogInfo::of(&recording, None);
-                prop_assert_eq!(info.eyes.iter().map(|eye| eye.samples).sum::<u64>(), recording.len() as u64);
-                prop_assert!(recording.samples().is_sorted_by_key(|sample| sample.t_sample));
-            }
-        }
-    }
-}
-
-fn shared_data() -> PathBuf {
-    let default = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
-    std::env::var_os("HOLOD_SHARED_DATA").map_or_else(default, PathBuf::from)
 }
 
 #[test]

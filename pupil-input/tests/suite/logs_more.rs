@@ -3,12 +3,13 @@
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use holod_calibration::TimeNs;
 use holod_pupil_input::wire::WireFault;
-use holod_pupil_input::{Blink, LogFault, LogFormat, Recording, ReplayError, SampleEye, SizeUnit};
+use holod_pupil_input::{Blink, LogFault, LogFormat, LogInfo, Recording, ReplayError, SampleEye, SizeUnit};
 use proptest::prelude::*;
 use tempfile::TempDir;
 
@@ -886,15 +887,19 @@ fn a_line_without_end_is_read_past() {
     assert_eq!(of_eye(&recording, Left).len(), 50);
 }
 
-/// Whatever is done to a log, it is read or refused.
-fn survives(content: &[u8], sidecar: Option<&str>) {
+/// Whatever is done to a log, or to the files beside it, it is read or refused.
+fn survives(content: &[u8], sidecar: &str, times: Option<&[u8]>) {
     let dir = TempDir::new().expect("a folder");
     let path = written(&dir, "x_recording-eye1_physio.tsv", content);
-    if let Some(sidecar) = sidecar {
-        written(&dir, "x_recording-eye1_physio.json", sidecar);
+    written(&dir, "x_recording-eye1_physio.json", sidecar);
+    if let Some(times) = times {
+        written(&dir, "x_recording-eye1_physio.time", times);
     }
     if let Ok(recording) = Recording::read(Path::new(&path)) {
         assert!(!recording.is_empty());
+        let info = LogInfo::of(&recording, None);
+        assert_eq!(info.eyes.iter().map(|eye| eye.samples).sum::<u64>(), recording.len() as u64);
+        assert!(recording.samples().is_sorted_by_key(|sample| sample.t_sample));
         for sample in recording.samples().filter(|sample| sample.valid) {
             assert!(sample.diameter_mm.is_finite() && sample.diameter_mm >= 0.0, "{sample:?}");
             assert!((0.0..=1.0).contains(&sample.confidence), "{sample:?}");
@@ -902,39 +907,50 @@ fn survives(content: &[u8], sidecar: Option<&str>) {
     }
 }
 
+/// A short log of each format.
+static EXAMPLES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
+    let mut examples = crate::logs::examples();
+    examples.extend([
+        tobii("Recording timestamp", 1.0, "").into_bytes(),
+        utf16(&tobii("Recording timestamp [ms]", 1.0, "")),
+        gazepoint(true).into_bytes(),
+        format!("{PUPILEXT}\n{}", "x,10,PuRe,40,41,4.5,40,41,0.9,1,2,3,130,0.9,0.8\n".repeat(9)).into_bytes(),
+        TABLE.into(),
+        gzip(TABLE),
+        xdf(&relay()),
+        b"t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n1,left,3.5,1,,1\n2,left,,0,7.5,0\n".to_vec(),
+    ]);
+    examples
+});
+
 proptest! {
-    #![proptest_config(ProptestConfig { failure_persistence: None, cases: 400, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { failure_persistence: None, cases: 800, ..ProptestConfig::default() })]
 
     #[test]
     fn a_mutated_log_of_any_format_is_read_or_refused(
-        which in 0..8_usize,
-        edits in proptest::collection::vec((any::<proptest::sample::Index>(), any::<u8>(), 0..4_u8), 0..12),
+        which in any::<proptest::sample::Index>(),
+        edits in proptest::collection::vec((any::<proptest::sample::Index>(), any::<u8>(), 0..7_u8), 0..12),
         cut in any::<proptest::sample::Index>(),
         cuts in proptest::bool::weighted(0.3),
+        timed in any::<bool>(),
     ) {
-        let mut content = match which {
-            0 => tobii("Recording timestamp", 1.0, "").into_bytes(),
-            1 => utf16(&tobii("Recording timestamp [ms]", 1.0, "")),
-            2 => gazepoint(true).into_bytes(),
-            3 => format!("{PUPILEXT}\n{}", "x,10,PuRe,40,41,4.5,40,41,0.9,1,2,3,130,0.9,0.8\n".repeat(9)).into_bytes(),
-            4 => TABLE.into(),
-            5 => gzip(TABLE),
-            6 => xdf(&relay()),
-            _ => b"t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n1,left,3.5,1,,1\n2,left,,0,7.5,0\n".to_vec(),
-        };
+        let mut content = which.get(&EXAMPLES).clone();
         for (index, byte, kind) in &edits {
-            let at = index.index(content.len());
+            let (at, many) = (index.index(content.len()), usize::from(*byte));
             match kind {
                 0 => content[at] = *byte,
                 1 => content.insert(at, *byte),
                 2 => content[at] ^= 1 << (byte % 8),
-                _ => { content.remove(at); }
+                3 => drop(content.drain(at..(at + many).min(content.len() - 1).max(at))),
+                4 => drop(content.splice(at..at, *b"9999999999999999999")),
+                5 => drop(content.splice(at..at, *b"-1e309\t.\t;,;\n\0nan")),
+                _ => drop(content.splice(at..at, b"\n".repeat(many % 4))),
             }
         }
         if cuts {
             content.truncate(cut.index(content.len()));
         }
-        survives(&content, Some(SIDECAR));
+        survives(&content, SIDECAR, timed.then(|| &content[..content.len() / 80 * 8]));
     }
 
     #[test]
@@ -942,6 +958,6 @@ proptest! {
         let mut sidecar = SIDECAR.as_bytes().to_vec();
         let at = at.index(sidecar.len());
         sidecar[at] = byte;
-        survives(TABLE.as_bytes(), Some(&String::from_utf8_lossy(&sidecar)));
+        survives(TABLE.as_bytes(), &String::from_utf8_lossy(&sidecar), None);
     }
 }

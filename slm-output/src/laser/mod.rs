@@ -329,11 +329,6 @@ pub trait LaserBox: Send {
     /// What it can do.
     fn capability(&self) -> Capability;
 
-    /// Whether it has no lasers. Only such a box is lit over a panel that is not there.
-    fn is_simulated(&self) -> bool {
-        self.capability().simulated
-    }
-
     /// How long [`Self::dark`] may wait for the acknowledgement.
     fn dark_wait(&self) -> TimeNs {
         TimeNs(450_000_000)

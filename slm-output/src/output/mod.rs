@@ -123,7 +123,7 @@ impl Output {
         clock: Clock,
     ) -> Result<Self, OutputError> {
         let flat = PanelSetup::new(&rig.panel, encoder).flat;
-        let virtual_bench = panel.is_virtual() && laser.is_simulated();
+        let virtual_bench = panel.is_virtual() && laser.capability().simulated;
         // A box with a wire to the panel's sync times its own windows, and in channel-packed mode the panel's own
         // sequence says which colour each of them is for: that frames go by is all that must be known here.
         let window_clock = WindowClock::of(&rig.panel, laser.capability());

@@ -410,43 +410,82 @@ fn a_latched_dark_stays_dark() {
     assert_eq!(bench.verdict().unsafe_findings().count(), 0);
 }
 
-/// A box that fails when it is told so.
-struct Faulty {
+/// A simulated box, with something between it and its host.
+struct Intercepted<B> {
     inner: SimulatedLaser,
-    fails: Arc<AtomicBool>,
+    between: B,
 }
 
-impl Faulty {
-    fn check(&self) -> Result<(), LaserError> {
-        let refused = LaserError::Refused { command: "test", refusal: Refusal::Malformed };
-        if self.fails.load(Ordering::Relaxed) { Err(refused) } else { Ok(()) }
+impl<B> Intercepted<B> {
+    fn new(t_boot: TimeNs, between: B) -> Self {
+        Self { inner: SimulatedLaser::new(t_boot), between }
     }
 }
 
-impl LaserBox for Faulty {
+/// What comes between; nothing, but for what it overrides.
+trait Between: Send {
+    fn capability(&self, capability: Capability) -> Capability {
+        capability
+    }
+    /// When a command that is sent `now` arrives.
+    fn arrives(&mut self, _command: &'static str, now: TimeNs) -> Result<TimeNs, LaserError> {
+        Ok(now)
+    }
+    /// What is left of a window.
+    fn left_of(&mut self, window: LitWindow) -> Option<LitWindow> {
+        Some(window)
+    }
+    fn next_missed(&mut self) -> Option<MissedLight> {
+        None
+    }
+    /// Before the box is asked what has happened.
+    fn polled(&mut self) {}
+}
+
+impl<B: Between> LaserBox for Intercepted<B> {
     fn capability(&self) -> Capability {
-        Capability { simulated: true, gates_fields: true, has_heartbeat: true, sync_wire: false }
+        self.between.capability(self.inner.capability())
     }
     fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
-        self.check().and_then(|()| self.inner.program(program, now))
+        self.inner.program(program, self.between.arrives("program", now)?)
     }
     fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.check().and_then(|()| self.inner.arm(now))
+        self.inner.arm(self.between.arrives("arm", now)?)
     }
     fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
-        self.check().and_then(|()| self.inner.sync(t_sync, now))
+        self.inner.sync(t_sync, self.between.arrives("sync", now)?)
     }
     fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
-        self.check().and_then(|()| self.inner.light(window, now))
+        let now = self.between.arrives("light", now)?;
+        self.between.left_of(window).map_or(Ok(None), |window| self.inner.light(window, now))
     }
     fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.check().and_then(|()| self.inner.heartbeat(now))
+        self.inner.heartbeat(self.between.arrives("heartbeat", now)?)
     }
     fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
-        self.check().and_then(|()| self.inner.dark(reason, now))
+        self.inner.dark(reason, self.between.arrives("dark", now)?)
+    }
+    fn next_missed(&mut self) -> Option<MissedLight> {
+        self.between.next_missed()
     }
     fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
-        self.inner.poll(now, event)
+        self.between.polled();
+        let tells_edges = self.capability().gates_fields;
+        self.inner.poll(now, &mut |happened| {
+            if tells_edges || !matches!(happened, BoxEvent::Edge(_)) {
+                event(happened);
+            }
+        })
+    }
+}
+
+/// A box that fails when it is told so.
+struct Faulty(Arc<AtomicBool>);
+
+impl Between for Faulty {
+    fn arrives(&mut self, command: &'static str, now: TimeNs) -> Result<TimeNs, LaserError> {
+        let refused = LaserError::Refused { command, refusal: Refusal::Malformed };
+        if self.0.load(Ordering::Relaxed) { Err(refused) } else { Ok(now) }
     }
 }
 
@@ -454,7 +493,7 @@ impl LaserBox for Faulty {
 fn a_box_that_fails_goes_dark_by_itself_and_is_tried_again_later() {
     for mode in MODES {
         let fails = Arc::new(AtomicBool::new(false));
-        let laser = Faulty { inner: SimulatedLaser::new(TimeNs(0)), fails: Arc::clone(&fails) };
+        let laser = Intercepted::new(TimeNs(0), Faulty(Arc::clone(&fails)));
         let mut bench = Bench::with_box(mode, Box::new(laser));
         bench.run(TimeNs(300 * MS), TimeNs(0));
         fails.store(true, Ordering::Relaxed);
@@ -505,7 +544,6 @@ impl Reporter {
 
 /// A box that answers late, while the panel goes on.
 struct Slow {
-    inner: SimulatedLaser,
     now: Arc<AtomicI64>,
     there_and_back: TimeNs,
     reporter: Arc<Mutex<Reporter>>,
@@ -529,36 +567,19 @@ impl Slow {
     }
 }
 
-impl LaserBox for Slow {
-    fn capability(&self) -> Capability {
-        self.inner.capability()
-    }
-    fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
-        self.inner.program(program, now)
-    }
-    fn arm(&mut self, _now: TimeNs) -> Result<(), LaserError> {
-        self.armed.fetch_add(1, Ordering::Relaxed);
-        if self.now.load(Ordering::Relaxed) > self.t_order.0 {
-            self.armed_after_order.fetch_add(1, Ordering::Relaxed);
+impl Between for Slow {
+    fn arrives(&mut self, command: &'static str, now: TimeNs) -> Result<TimeNs, LaserError> {
+        match command {
+            "arm" => {
+                self.armed.fetch_add(1, Ordering::Relaxed);
+                if self.now.load(Ordering::Relaxed) > self.t_order.0 {
+                    self.armed_after_order.fetch_add(1, Ordering::Relaxed);
+                }
+                Ok(self.wait())
+            }
+            "dark" => Ok(self.wait()),
+            _ => Ok(now),
         }
-        let now = self.wait();
-        self.inner.arm(now)
-    }
-    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
-        self.inner.sync(t_sync, now)
-    }
-    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
-        self.inner.light(window, now)
-    }
-    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.inner.heartbeat(now)
-    }
-    fn dark(&mut self, reason: DarkReason, _now: TimeNs) -> Result<(), LaserError> {
-        let now = self.wait();
-        self.inner.dark(reason, now)
-    }
-    fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
-        self.inner.poll(now, event)
     }
 }
 
@@ -582,19 +603,21 @@ fn a_box_that_answers_more_slowly_than_refreshes_come_is_armed_once_and_not_agai
             // While the first ARM is waited for.
             let t_order = if index == 2 { TimeNs(i64::MAX) } else { T_FIRST + TimeNs(8 * field_period.0 + 3 * MS) };
             let armed = Arc::new(AtomicU64::new(0));
-            let mut inner = SimulatedLaser::new(TimeNs(0));
-            inner.program(&bench.laser.program, TimeNs(0)).unwrap();
-            bench.laser.laser = Box::new(Slow {
-                inner,
-                now: Arc::clone(&now),
-                there_and_back: TimeNs(there_and_back_ms * MS),
-                reporter: Arc::clone(&reporter),
-                shared: Arc::clone(&bench.laser.shared),
-                t_order,
-                order,
-                armed: Arc::clone(&armed),
-                armed_after_order: Arc::clone(&armed_after_order),
-            });
+            let mut laser = Intercepted::new(
+                TimeNs(0),
+                Slow {
+                    now: Arc::clone(&now),
+                    there_and_back: TimeNs(there_and_back_ms * MS),
+                    reporter: Arc::clone(&reporter),
+                    shared: Arc::clone(&bench.laser.shared),
+                    t_order,
+                    order,
+                    armed: Arc::clone(&armed),
+                    armed_after_order: Arc::clone(&armed_after_order),
+                },
+            );
+            laser.program(&bench.laser.program, TimeNs(0)).unwrap();
+            bench.laser.laser = Box::new(laser);
             let obeyed = |shared: &Shared| {
                 let asked = shared.dark_answer.load(Ordering::Acquire) != 0;
                 [asked, shared.acknowledged.load(Ordering::Acquire) != NOT_YET, false][index]
@@ -623,7 +646,6 @@ fn a_box_that_answers_more_slowly_than_refreshes_come_is_armed_once_and_not_agai
 
 /// A box that hears of every `each`th window too late, for half of it or for all, and says so only at the next poll.
 struct Deaf {
-    inner: SimulatedLaser,
     asked: u64,
     each: u64,
     is_whole: bool,
@@ -631,44 +653,22 @@ struct Deaf {
     missed: VecDeque<MissedLight>,
 }
 
-impl LaserBox for Deaf {
-    fn capability(&self) -> Capability {
-        self.inner.capability()
-    }
-    fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
-        self.inner.program(program, now)
-    }
-    fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.inner.arm(now)
-    }
-    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
-        self.inner.sync(t_sync, now)
-    }
-    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+impl Between for Deaf {
+    fn left_of(&mut self, window: LitWindow) -> Option<LitWindow> {
         self.asked += 1;
         if !self.asked.is_multiple_of(self.each) {
-            return self.inner.light(window, now);
+            return Some(window);
         }
         let whole = window.t_off - window.t_on;
         let time = if self.is_whole { whole } else { TimeNs(whole.0 / 2) };
         self.answered.push_back(MissedLight { window, time });
-        if self.is_whole {
-            return Ok(None);
-        }
-        self.inner.light(LitWindow { t_on: window.t_on + time, ..window }, now)
-    }
-    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.inner.heartbeat(now)
-    }
-    fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
-        self.inner.dark(reason, now)
+        (!self.is_whole).then_some(LitWindow { t_on: window.t_on + time, ..window })
     }
     fn next_missed(&mut self) -> Option<MissedLight> {
         self.missed.pop_front()
     }
-    fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+    fn polled(&mut self) {
         self.missed.append(&mut self.answered);
-        self.inner.poll(now, event)
     }
 }
 
@@ -676,9 +676,8 @@ impl LaserBox for Deaf {
 fn light_that_the_box_missed_is_told_and_costs_the_other_colours_as_much() {
     // Of every fourth window each colour loses one in turn, of every third always the same.
     for (each, is_whole) in [(4, false), (4, true), (3, false), (3, true)] {
-        let inner = SimulatedLaser::new(TimeNs(0));
         let (answered, missed) = (VecDeque::new(), VecDeque::new());
-        let laser = Deaf { inner, asked: 0, each, is_whole, answered, missed };
+        let laser = Intercepted::new(TimeNs(0), Deaf { asked: 0, each, is_whole, answered, missed });
         let mut bench = Bench::with_box(PanelMode::FieldSequential, Box::new(laser));
         bench.run(TimeNs(4000 * MS), TimeNs(0));
         bench.laser.latch(DarkReason::Shutdown, TimeNs(4000 * MS));
@@ -702,43 +701,21 @@ fn light_that_the_box_missed_is_told_and_costs_the_other_colours_as_much() {
 }
 
 /// A box that is simply on while it is armed, and tells no edges.
-struct Switch(SimulatedLaser);
+struct Switch;
 
-impl LaserBox for Switch {
-    fn capability(&self) -> Capability {
-        Capability { simulated: true, gates_fields: false, has_heartbeat: true, sync_wire: false }
+impl Between for Switch {
+    fn capability(&self, capability: Capability) -> Capability {
+        Capability { gates_fields: false, ..capability }
     }
-    fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
-        self.0.program(program, now)
-    }
-    fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.0.arm(now)
-    }
-    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
-        self.0.sync(t_sync, now)
-    }
-    fn light(&mut self, _window: LitWindow, _now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
-        Ok(None)
-    }
-    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.0.heartbeat(now)
-    }
-    fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
-        self.0.dark(reason, now)
-    }
-    fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
-        self.0.poll(now, &mut |happened| {
-            if !matches!(happened, BoxEvent::Edge(_)) {
-                event(happened);
-            }
-        })
+    fn left_of(&mut self, _window: LitWindow) -> Option<LitWindow> {
+        None
     }
 }
 
 #[test]
 fn a_field_of_a_box_that_tells_no_edges_is_not_said_to_be_dark() {
     for mode in MODES {
-        let mut bench = Bench::with_box(mode, Box::new(Switch(SimulatedLaser::new(TimeNs(0)))));
+        let mut bench = Bench::with_box(mode, Box::new(Intercepted::new(TimeNs(0), Switch)));
         bench.run(TimeNs(1000 * MS), TimeNs(0));
         bench.laser.latch(DarkReason::Shutdown, TimeNs(1000 * MS));
         bench.run(TimeNs(1200 * MS), TimeNs(0));
@@ -866,7 +843,7 @@ fn darkness_that_is_asked_for_is_acknowledged_each_time_or_said_not_to_be() {
     // A box that fails is not dark because nothing new is heard of it.
     let panel = HeadlessPanel::new(&PanelSetup::new(&rig.panel, &encoder), host_now(), ReportFaults::NONE);
     let fails = Arc::new(AtomicBool::new(false));
-    let laser = Faulty { inner: SimulatedLaser::new(host_now()), fails: Arc::clone(&fails) };
+    let laser = Intercepted::new(host_now(), Faulty(Arc::clone(&fails)));
     let options = OutputOptions::default();
     let failing = Output::start(&rig, &encoder, Box::new(panel), Box::new(laser), options, host_now).unwrap();
     fails.store(true, Ordering::Relaxed);

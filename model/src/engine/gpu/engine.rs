@@ -304,11 +304,6 @@ impl GpuEngine {
     pub fn lose_device(&self) {
         self.gpu.device.destroy();
     }
-
-    /// As many bytes as the engine's buffers have on the device.
-    pub fn device_bytes(&self) -> u64 {
-        self.loaded.bytes()
-    }
 }
 
 /// What `open` gives where it may use matrix units, or where the driver refuses that, without; and why. A driver may

@@ -34,11 +34,6 @@ impl LoadedPlan {
         &self.buffers[id.0]
     }
 
-    /// Bytes of all buffers.
-    pub(super) fn bytes(&self) -> u64 {
-        self.buffers.iter().map(wgpu::Buffer::size).sum()
-    }
-
     /// Adds each stage to `encoder` as a pass of its own, with the timestamps that `timestamps` gives for its number.
     pub(super) fn encode<'a>(
         &self,

@@ -180,7 +180,7 @@ impl Day {
     fn new(seed: u64) -> Self {
         let rig = day_rig();
         let fails = Arc::new(AtomicBool::new(false));
-        let faulty = Faulty { inner: SimulatedLaser::new(TimeNs(0)), fails: Arc::clone(&fails) };
+        let faulty = Intercepted::new(TimeNs(0), Faulty(Arc::clone(&fails)));
         let Bench { laser, news, events, box_events, .. } = Bench::with_rig(&rig, Box::new(faulty));
         let period = laser.scheduler.gate().timing().refresh_period;
         let panel = TruePanel { period, t_next: T_FIRST, field: 0, frame: None, waiting: None, lost: false };

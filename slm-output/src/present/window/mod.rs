@@ -523,34 +523,31 @@ impl Presenter for WindowPanel {
         frames: &mut FrameSource,
         presented: &mut dyn FnMut(PresentedRefresh),
     ) -> Result<(), PanelFault> {
-        let mut work = || {
-            self.collect()?;
-            // What came arrived after `now`, perhaps.
-            self.report_due(host_now(), presented);
-            if let Some(picture) = self.on_its_way {
-                if now - picture.since > STUCK {
-                    return Err(PanelFault::WindowLost);
-                }
-                self.t_next = picture.came.map_or(picture.since + STUCK, |came| came.t_present);
-                return Ok(());
-            }
-            if now < self.t_next {
-                return Ok(());
-            }
-            self.present(now, frames)?;
-            self.t_next = now + STUCK;
-            if self.open.as_ref().is_some_and(|open| open.timeline.is_none())
-                && let Some(picture) = self.on_its_way.take()
-            {
-                let t_present = host_now();
-                self.t_next = (now + self.timing.refresh_period).max(t_present);
-                let came = Presented { t_present, provenance: TimestampSource::Software, refresh_count: None };
-                self.report(picture, came, presented);
-            }
-            Ok(())
-        };
         // A panel that is lost is closed when it is opened again: that takes time, and the lasers must hear of it now.
-        work()
+        self.collect()?;
+        // What came arrived after `now`, perhaps.
+        self.report_due(host_now(), presented);
+        if let Some(picture) = self.on_its_way {
+            if now - picture.since > STUCK {
+                return Err(PanelFault::WindowLost);
+            }
+            self.t_next = picture.came.map_or(picture.since + STUCK, |came| came.t_present);
+            return Ok(());
+        }
+        if now < self.t_next {
+            return Ok(());
+        }
+        self.present(now, frames)?;
+        self.t_next = now + STUCK;
+        if self.open.as_ref().is_some_and(|open| open.timeline.is_none())
+            && let Some(picture) = self.on_its_way.take()
+        {
+            let t_present = host_now();
+            self.t_next = (now + self.timing.refresh_period).max(t_present);
+            let came = Presented { t_present, provenance: TimestampSource::Software, refresh_count: None };
+            self.report(picture, came, presented);
+        }
+        Ok(())
     }
 
     fn show_flat(&mut self) {
