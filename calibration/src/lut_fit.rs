@@ -1,15 +1,15 @@
 //! A panel's look-up table from powers that were measured on the bench.
 //!
-//! **What is measured.** Lines of level 0 and of level n, half a period each, send sin²(φ(n)/2) of their light into a
-//! first order, φ(n) being the phase between the two (J. W. Goodman, *Introduction to Fourier Optics*, 4.4). So the
-//! power in that order is P(n) = B + A·sin²(φ(n)/2), where B is light that is always there.
+//! **What is measured.** Lines of level 0 and of level n, half a period each, send (2/π)²·sin²(φ(n)/2) of their light
+//! into a first order, φ(n) being the phase between the two (J. W. Goodman, *Introduction to Fourier Optics*, 4.4). So
+//! the power in that order is P(n) = B + A·sin²(φ(n)/2), where B is light that is always there.
 //!
 //! **How it is read back.** Where the power turns round, the phase is a whole multiple of π; in between it is at first
 //! the arccosine of the power, on the branch between two turns. From there a curve φ(n) whose slope changes little (a
 //! discrete smoothing spline; C. H. Reinsch, Numer. Math. 10, 1967) is fitted to the powers themselves by Gauss and
-//! Newton's method, and A and B with it: an arccosine alone would bend the curve at the turns, where all noise points to
-//! one side. How stiff the curve is, the rows say: as much as lets the others foretell each fifth one best, and at least
-//! so much that the phase never runs back.
+//! Newton's method, and A and B with it: an arccosine alone would bend the curve at the turns, where all noise points
+//! to one side. How stiff the curve is, the rows say: as much as lets the others foretell each fifth one best, and at
+//! least so much that the phase never runs back.
 
 use std::f64::consts::PI;
 
@@ -68,13 +68,13 @@ pub enum LutFitError {
     Power { level: u16, power: f64 },
     /// Level 0 beside itself has no lines.
     #[error(
-        "the power falls first, down to level {turn}; expected the least at level 0, whose lines are none: measure a \
+        "the power falls first, down to level {turn}; expected the least power at level 0, where there are no lines: measure a \
          first order of lines of level 0 and each other one (`holod pattern two-levels 0 LEVEL`), not the middle"
     )]
     Falls { turn: u16 },
     /// Less than half a wave.
     #[error(
-        "the power never turns round; expected a stroke of more than 1.1 π, below which the height of the fringe is not \
+        "the power never turns round; expected a stroke of more than 1.2 π, below which the height of the fringe is not \
          known, and lines that move the power: look whether the order is the first one and the levels change"
     )]
     NoTurn,
@@ -416,7 +416,10 @@ mod tests {
         let mut none = sound.clone();
         none[4].power = f64::NAN;
         assert!(matches!(refused(&none, 256), LutFitError::Power { level: 4, .. }));
-        assert_eq!(refused(&swept(0.8, 1, 0.0, 7), 256), LutFitError::NoTurn);
+        for too_little_pi in [0.8, 1.12] {
+            assert_eq!(refused(&swept(too_little_pi, 1, 0.0, 7), 256), LutFitError::NoTurn, "{too_little_pi} π");
+        }
+        assert!(fit(&swept(1.2, 8, 0.0, 7), 256).is_ok());
         let dark: Vec<_> = sound.iter().map(|row| LevelPower { power: 0.0, ..*row }).collect();
         assert_eq!(refused(&dark, 256), LutFitError::NoTurn);
         let middle: Vec<_> = sound.iter().map(|row| LevelPower { power: 5.0 - row.power, ..*row }).collect();

@@ -312,7 +312,8 @@ impl Gate {
                 return Some(Rejection::Slew);
             }
         }
-        if let Some(oldest) = self.pending[self.oldest].filter(|_| self.waiting > 0) {
+        // Of neighbours the step has been judged.
+        if let Some(oldest) = self.pending[self.oldest].filter(|_| self.waiting > 1) {
             let (elapsed, moved) = (t - oldest.t_sample, (sample.diameter_mm - oldest.diameter_mm).abs());
             let allowed = self.step.noise_alone_mm() + self.settings.slew_mm_per_s * elapsed.seconds() as f32;
             if 2 * elapsed.0 >= self.settings.lead.0 && moved > allowed {

@@ -300,6 +300,15 @@ fn text_lasers_are_recognised_put_out_set_lit_and_put_out() {
         laser.dark(DarkReason::Asked, host_now()).unwrap();
         assert!(!bench.with(|device| device.lit), "{name}");
 
+        let without_power = LaserProgram { power_uw: PerColour([0; 3]), ..program(GREEN) };
+        laser.program(&without_power, host_now()).unwrap();
+        laser.arm(host_now()).unwrap();
+        let t_end = host_now() + TimeNs(300_000_000);
+        alive_until(laser.as_mut(), || host_now() > t_end);
+        assert!(!bench.with(|device| device.lit), "{name}: a laser without power stays off");
+        assert_eq!(bench.with(|device| device.power_w.clone()), "0.001000", "{name}: and is told none");
+        laser.dark(DarkReason::Asked, host_now()).unwrap();
+
         let missing = laser.program(&program(PanelMode::Monochrome(Colour::Red)), host_now()).unwrap_err();
         assert!(matches!(missing, LaserError::NoLaser { colour: Colour::Red }), "{missing}");
         let foretold = |mode| takes(&lasers(driver.clone()), &program(mode), None);

@@ -65,7 +65,7 @@ fn a_sweep_that_gives_no_table_says_what_is_missing() {
     for (name, text, exit, says) in [
         ("row.csv", sweep(1).replace("\n40,", "\n40;"), 65, "row.csv: line 43: found `40;"),
         ("short.csv", sweep(1).lines().take(200).collect::<Vec<_>>().join("\n"), 65, "expected all of 0 to 255"),
-        ("middle.csv", middle, 65, "expected the least at level 0"),
+        ("middle.csv", middle, 65, "expected the least power at level 0"),
         ("none.csv", String::new(), 65, "found 0 rows"),
     ] {
         fs::write(at(name), text).unwrap();

@@ -292,6 +292,7 @@ fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: scene::Fram
         pictures: Pictures::Scene(Arc::new(frames)),
         output: OutputSpec::Headless(ReportFaults::NONE),
         tracker: TrackerSpec::Mock(Scenario::Sweep),
+        ports_of_others: Vec::new(),
         pupil: None,
         record_tracker: None,
         record: None,

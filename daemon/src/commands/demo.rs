@@ -70,6 +70,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             pictures: Pictures::Scene(Arc::new(frames)),
             output: OutputSpec::Headless(ReportFaults::NONE),
             tracker: TrackerSpec::Mock(SCENARIO),
+            ports_of_others: Vec::new(),
             pupil: None,
             record_tracker: None,
             record: None,

@@ -40,7 +40,10 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     refuse_lasers(args)?;
     // From the first reading on, another may be asked for.
     let hangups = if args.rig.config.is_some() { Hangups::take_over()? } else { None };
-    let rig = rig_of(args)?;
+    let rig = setup::rig_with_network(&args.rig, &args.network)?;
+    // Those of lasers in whose place there are simulated ones, too.
+    let ports_of_others = setup::ports_of_others(&rig);
+    let rig = with_options(rig, args);
     let spec = rig.tracker.spec.clone().unwrap_or_else(|| SAMPLE_TRACKER.to_owned());
     // The rig's own was judged with the rig.
     let tracker: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
@@ -78,13 +81,14 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let again = args.clone();
     let plan = SessionPlan {
         rig,
-        rig_again: args.rig.config.is_some().then(|| Arc::new(move || rig_of(&again)) as RigReader),
+        rig_again: args.rig.config.is_some().then(|| Arc::new(move || rig_again(&again)) as RigReader),
         hangups,
         weights,
         backend: args.backend,
         pictures,
         output,
         tracker,
+        ports_of_others,
         pupil: args.pupil,
         record_tracker: observers.0.as_ref().map(|recorder| RecordFiles::in_folder(&recorder.folder())),
         record: observers.0.as_ref().map(Recorder::health),
@@ -145,12 +149,12 @@ pub(super) fn judge(args: &RunArgs, rig: &Rig) -> Result<(), Failure> {
     refuse_lasers(args)?;
     page::judge(&args.page)?;
     source::judge(&args.scene, args.feed_dark_after, &rig.geometry)?;
-    let rig = with_options(rig.clone(), args);
-    let spec = rig.tracker.spec.as_deref().unwrap_or(SAMPLE_TRACKER);
+    let meant = with_options(rig.clone(), args);
+    let spec = meant.tracker.spec.as_deref().unwrap_or(SAMPLE_TRACKER);
     let spec: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
-    setup::refuse_port_of_others(&spec, &rig)?;
+    setup::refuse_port_of_others(&spec, rig)?;
     if spec.files().iter().all(|file| file.exists()) {
-        Tracker::examine(&spec, &rig.tracker).map_err(setup::tracker_failure)?;
+        Tracker::examine(&spec, &meant.tracker).map_err(setup::tracker_failure)?;
     }
     Ok(())
 }
@@ -182,6 +186,7 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
         pictures,
         output,
         tracker: tracker.clone(),
+        ports_of_others: Vec::new(),
         pupil: None,
         record_tracker: None,
         record: None,
@@ -277,7 +282,7 @@ fn tell(args: &RunArgs, summary: &Summary, outcome: Option<&Outcome>) -> Result<
 }
 
 /// The rig with what the command line says in its place.
-fn rig_of(args: &RunArgs) -> Result<Rig, Failure> {
+fn rig_again(args: &RunArgs) -> Result<Rig, Failure> {
     setup::rig_with_network(&args.rig, &args.network).map(|rig| with_options(rig, args))
 }
 
@@ -340,6 +345,7 @@ struct KeptLevels {
 /// Saves the levels first: the summary says whether they are there.
 fn save(session: &SessionReport, folder: &Path, health: &RecordHealth) {
     let cannot = |failure: Failure| health.give_up(&format!("cannot finish it: {failure}"));
+    health.look_for_folder();
     record::judge_parts(folder).unwrap_or_else(cannot);
     let shown_levels = save_shown(session, folder).unwrap_or_else(|failure| {
         cannot(failure);
@@ -383,7 +389,8 @@ mod tests {
         };
         assert!(judged(&[]).unwrap_err().contains("/dev/null that the rig names for its lasers"));
         assert_eq!(judged(&["--tracker", "mock:steady"]), Ok(()));
-        assert_eq!(judged(&["--lasers", "simulated"]), Ok(()));
+        assert!(judged(&["--lasers", "simulated"]).unwrap_err().contains("that the rig names for its lasers"));
+        assert_eq!(judged(&["--lasers", "simulated", "--tracker", "mock:steady"]), Ok(()));
         let on_panel = judged(&["--lasers", "simulated", "--output", "drm:DP-1"]).unwrap_err();
         assert!(on_panel.contains("found --output drm:DP-1, expected headless"), "{on_panel}");
     }

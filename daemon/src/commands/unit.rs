@@ -271,6 +271,8 @@ fn drivers(nodes: &str, root: &Path) -> Vec<String> {
     let module = |node: &String| fs::read_link(class.join(node).join("device/driver/module")).ok();
     let modules = names(&class, nodes).iter().filter_map(module).collect::<BTreeSet<_>>();
     let names = modules.iter().filter_map(|module| module.file_name()?.to_str());
+    // Its nodes come from a module of their own.
+    let names = names.map(|name| if name == "nvidia" { "nvidia_drm" } else { name });
     names.map(|name| format!("modprobe@{name}.service")).collect()
 }
 
@@ -483,7 +485,7 @@ mod tests {
             assert_eq!(of("Wants="), of("After="), "{text}");
             of("After=")
         };
-        let [amdgpu, ast, nvidia] = ["amdgpu", "ast", "nvidia"].map(|module| format!("modprobe@{module}.service"));
+        let [amdgpu, ast, nvidia] = ["amdgpu", "ast", "nvidia_drm"].map(|module| format!("modprobe@{module}.service"));
         assert_eq!(waits(&[]), Some(format!("{amdgpu} {nvidia}")));
         assert_eq!(waits(&["--backend", "cpu"]), None);
         assert_eq!(waits(&["--backend", "cpu", "--output", "drm:DP-2"]), Some(format!("{amdgpu} {ast}")));

@@ -34,7 +34,7 @@ const STACK_BYTES: usize = 8 << 20;
 const PATIENCE: Duration = Duration::from_secs(5);
 /// How long the end of a run waits for answers to be sent.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// Turns within which whatever had come before them is read: one for the socket, one for a connection, and some more.
+/// Turns of the runtime after which all requests that had come before are read: one for the socket, one for a connection, and some more.
 const TURNS: u32 = 4;
 
 /// A control socket that listens. Dropping it ends that.

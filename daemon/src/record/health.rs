@@ -78,7 +78,7 @@ impl RecordHealth {
     }
 
     /// Looks where its folder is, which may take as long as a disk does, and says where that has changed.
-    pub(super) fn look_for_folder(&self) {
+    pub(crate) fn look_for_folder(&self) {
         let found = self.place.moved_to();
         let mut moved_to = self.moved_to();
         if *moved_to == found {

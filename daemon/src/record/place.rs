@@ -43,7 +43,16 @@ impl Place {
 
     /// A text with the name of the folder in place of [`Self::itself`].
     pub(super) fn named(&self, text: &str) -> String {
-        text.replace(&*self.itself().to_string_lossy(), &self.path.to_string_lossy())
+        let (itself, path) = (self.itself(), self.path.to_string_lossy());
+        let itself = itself.to_string_lossy();
+        // What has more digits is another descriptor.
+        let parts: Vec<&str> = text.split(&*itself).collect();
+        let mut named = parts[0].to_owned();
+        for part in &parts[1..] {
+            named.push_str(if part.starts_with(|c: char| c.is_ascii_digit()) { &itself } else { &path });
+            named.push_str(part);
+        }
+        named
     }
 
     /// A failure whose text is [so](Self::named).
@@ -94,6 +103,8 @@ mod tests {
         }
         let text = place.named(&format!("{}: full", place.itself().join("file").display()));
         assert_eq!(text, format!("{}: full", path.join("file").display()));
+        let others = format!("{}7/file: full", place.itself().display());
+        assert_eq!(place.named(&others), others);
         fs::remove_dir(&path).unwrap();
         fs::rename(&elsewhere, &path).unwrap();
         assert_eq!(place.moved_to(), None);

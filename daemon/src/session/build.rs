@@ -108,7 +108,7 @@ pub(super) fn build(
     let tracker_options = TrackerOptions {
         origin: t_origin,
         record: plan.record_tracker.clone(),
-        forbidden: setup::ports_of_others(rig),
+        forbidden: plan.ports_of_others.clone(),
         reader_begins: Some(scheduling::raise),
     };
     let tracker = if plays {

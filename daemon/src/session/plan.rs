@@ -1,5 +1,6 @@
 //! What to run.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -35,6 +36,8 @@ pub struct SessionPlan {
     pub pupil: Option<PupilDiameter>,
     /// Where samples come from; nothing is opened where a record is played.
     pub tracker: TrackerSpec,
+    /// Serial ports that it must not open, whichever it is.
+    pub ports_of_others: Vec<PathBuf>,
     /// Where the tracker's bytes and samples are written down.
     pub record_tracker: Option<RecordFiles>,
     /// Whether the run's record goes on.

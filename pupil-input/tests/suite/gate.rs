@@ -119,7 +119,7 @@ fn a_slow_lid_of_which_nobody_tells_is_not_followed() {
         let shown = shown_of(lidded(QUIET, mm_per_s, depth_mm), settings(rig::Eye::Left));
         let worst_mm = shown.worst_tracking_mm.max(shown.worst_holding_mm);
         // A part of its way is within what noise explains, and is run on for the wait and the time ahead.
-        assert!(worst_mm < 0.6, "{mm_per_s} mm/s, {depth_mm} mm: {worst_mm}");
+        assert!(worst_mm < (0.9 * depth_mm as f32).min(0.6), "{mm_per_s} mm/s, {depth_mm} mm: {worst_mm}");
         assert!(shown.tracking > 0.8, "{mm_per_s} mm/s, {depth_mm} mm: {}", shown.tracking);
     }
 }

@@ -138,8 +138,10 @@ impl<H: Hardware> Controller<H> {
             self.gate = None;
             self.hardware.set_power(self.machine.power_uw());
         }
-        if self.machine.lit() != self.gate {
-            self.gate = self.machine.lit();
+        let powers_uw = self.machine.power_uw();
+        let lit = self.machine.lit().filter(|laser| powers_uw[laser.index()] > 0);
+        if lit != self.gate {
+            self.gate = lit;
             self.hardware.set_gate(self.gate);
         }
         if let Some((t, reason)) = went_dark {

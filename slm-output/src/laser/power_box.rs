@@ -237,7 +237,7 @@ pub(super) fn put_out_beside<D>(
     }
 }
 
-/// The lasers that are lit in `program`, of those that a bench `has`.
+/// The lasers that are lit in `program`, of those that a bench `has`: one without power stays off.
 ///
 /// # Errors
 /// [`LaserError::CannotGate`], [`LaserError::NoLaser`].
@@ -246,10 +246,12 @@ pub(super) fn colours_lit(
     gated_by_panel: bool,
     has: PerColour<bool>,
 ) -> Result<PerColour<bool>, LaserError> {
-    let lit = PerColour(Colour::ALL.map(|colour| program.sequence.contains(&colour)));
-    if lit.0.iter().filter(|&&lit| lit).count() > 1 && !gated_by_panel {
+    let is_in = |colour: Colour| program.sequence.contains(&colour);
+    // One that is lit among fields of others would be on in theirs, too.
+    if Colour::ALL.into_iter().filter(|&colour| is_in(colour)).count() > 1 && !gated_by_panel {
         return Err(LaserError::CannotGate);
     }
+    let lit = PerColour(Colour::ALL.map(|colour| is_in(colour) && program.power_uw[colour] > 0));
     match Colour::ALL.into_iter().find(|&colour| lit[colour] && !has[colour]) {
         None => Ok(lit),
         Some(colour) => Err(LaserError::NoLaser { colour }),

@@ -170,8 +170,9 @@ impl PowerDevice for TextLasers {
 
     fn set_power(&mut self, power_uw: PerColour<u32>) -> Result<(), LaserError> {
         for colour in Colour::ALL {
-            let Some(laser) = &mut self.0[colour] else { continue };
             let uw = power_uw[colour];
+            // One without power is not switched on, and may have no such power.
+            let Some(laser) = self.0[colour].as_mut().filter(|_| uw > 0) else { continue };
             let watts = format!("{}.{:06}", uw / 1_000_000, uw % 1_000_000);
             let milliwatts = format!("{}.{:03}", uw / 1000, uw % 1000);
             let command = laser.profile.power.replace("{power_w}", &watts).replace("{power_mw}", &milliwatts);
