@@ -41,8 +41,8 @@ fn measured_powers_become_a_table_that_the_rig_takes() {
     assert!(made.status.success(), "{}", made.stderr);
     assert!(made.stdout.contains("the phase of 256 levels, up to 1.9"), "{}", made.stdout);
     let table = fs::read_to_string(at("lut.csv")).unwrap();
-    assert!(most_off(&table, 1.0) < 0.01, "{table}");
-    assert!(most_off(&table.replace("\n100,", "\n100,9"), 1.0) > 0.01, "another table is told");
+    assert!(most_off(&table, 1.0) < 0.02, "{table}");
+    assert!(most_off(&table.replace("\n100,", "\n100,9"), 1.0) > 0.02, "another table is told");
 
     let with =
         rig.replace("[optics]", "lut_file = { green = \"lut.csv\" }\n[optics]").replace(" green = 1.9921875,", "");
@@ -53,7 +53,7 @@ fn measured_powers_become_a_table_that_the_rig_takes() {
     fs::write(at("falls.toml"), rig.replace("phase_sign = \"positive\"", "phase_sign = \"negative\"")).unwrap();
     let falls = run(HOLOD, &["lut", "green.csv", "--out", "-", "--config", "falls.toml"], folder.path());
     assert!(falls.status.success(), "{}", falls.stderr);
-    assert!(most_off(&falls.stdout, -1.0) < 0.01, "{}", falls.stdout);
+    assert!(most_off(&falls.stdout, -1.0) < 0.02, "{}", falls.stdout);
 }
 
 #[test]
