@@ -75,6 +75,7 @@ fn run(out: &Path) -> Result<(), Failure> {
         })),
         output: OutputSpec::Headless(ReportFaults::NONE),
         tracker: TrackerSpec::Mock(Scenario::Steady),
+        ports_of_others: Vec::new(),
         pupil: None,
         record_tracker: None,
         record: None,
