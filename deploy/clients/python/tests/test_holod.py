@@ -259,3 +259,23 @@ def test_a_running_holod_is_changed(holod: Holod, monkeypatch: pytest.MonkeyPatc
     assert json.loads(holod.process.communicate(timeout=60)[0])["ended_by"] == "holod ctl stop"
     with pytest.raises(ControlError, match="no holod runs that has a control socket"):
         Control()
+
+
+def test_the_sweep_of_the_page_on_calibration_becomes_a_table(
+    binary: str, holod: Holod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (HERE.parents[3] / "calibration/doc/calibrate.md").read_text()
+    script = page.split("```python\n")[1].split("```")[0]
+    phase_rad = 2.1 * np.pi * (np.arange(256) / 255) ** 1.2
+    powers_mw = iter(0.4 * np.sin(phase_rad[[*range(0, 256, 2), 255]] / 2) ** 2)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    monkeypatch.setattr("builtins.input", lambda _: str(next(powers_mw)))
+    exec(compile(script, "calibrate.md", "exec"), {})
+
+    command = [binary, "lut", "green-powers.csv", "--out", "-"]
+    table = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+    found_rad = np.loadtxt(table.splitlines(), delimiter=",", skiprows=2)[:, 1]
+    assert np.abs(found_rad - phase_rad).max() < 0.03
+    assert np.abs(found_rad - np.roll(phase_rad, 2)).max() > 0.03
