@@ -353,6 +353,28 @@ fn a_laser_that_is_not_in_the_sequence_is_not_lit() {
 }
 
 #[test]
+fn the_gate_of_a_laser_without_power_stays_closed() {
+    for trigger in [Trigger::Host, Trigger::Sync] {
+        let mut bench = Bench::programmed(trigger);
+        bench.ask(Command::Power([10, 0, 30])).unwrap();
+        bench.ask(Command::Arm).unwrap();
+        match trigger {
+            Trigger::Host => {
+                for (laser, t_on) in [(Laser::Green, 400), (Laser::Red, 1400), (Laser::Blue, 2400)] {
+                    bench.ask(light(laser, t_on, t_on + 300)).unwrap();
+                }
+            }
+            _ => bench.edge(0),
+        }
+        bench.run_until(2800);
+        let was_open = |laser: Laser| {
+            bench.wires.borrow().pins.iter().any(|pin| matches!(pin, Pin::Gate(Some(lit)) if *lit == laser))
+        };
+        assert_eq!([Laser::Red, Laser::Green, Laser::Blue].map(was_open), [true, false, true], "{trigger:?}");
+    }
+}
+
+#[test]
 fn programs_that_no_box_can_run_are_refused() {
     let sequence = Sequence::new(Laser::ALL).unwrap();
     let with_field = |field, delay_us, width_us| Command::Field { field, window: Window { delay_us, width_us } };
