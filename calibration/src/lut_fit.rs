@@ -68,8 +68,9 @@ pub enum LutFitError {
     Power { level: u16, power: f64 },
     /// Level 0 beside itself has no lines.
     #[error(
-        "the power falls first, down to level {turn}; expected the least power at level 0, where there are no lines: measure a \
-         first order of lines of level 0 and each other one (`holod pattern two-levels 0 LEVEL`), not the middle"
+        "the power falls first, down to level {turn}; expected the least power at level 0, where there are no lines: \
+         measure a first order of lines of level 0 and each other one (`holod pattern two-levels 0 LEVEL`), not the \
+         middle"
     )]
     Falls { turn: u16 },
     /// Less than half a wave.
