@@ -186,6 +186,7 @@ impl Timed {
             }
             seconds = seconds.min(began.elapsed().as_secs_f64());
         }
+        renderer::check_last_hologram(&mut *renderer)?;
         Ok(Self { renderer, seconds })
     }
 }
@@ -368,7 +369,7 @@ mod tests {
     #[test]
     fn an_engine_that_fails_is_not_timed_as_another_one() {
         let timed = |frames: &[(Duration, bool)]| {
-            let renderer = Box::new(Failing { frames: frames.iter().copied().collect() });
+            let renderer = Box::new(Failing::new(frames));
             let size = Resolution { width: 8, height: 8 };
             let encoder = renderer::panel_encoder(&Rig::default(), size).unwrap();
             let frame = Arc::new(scene::sample_frame(size));

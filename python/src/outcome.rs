@@ -53,7 +53,8 @@ pub(crate) fn with_threads<T: Send>(py: Python<'_>, work: impl FnOnce() -> Resul
 }
 
 /// Options of the command line that failures name, and the arguments that they are here.
-const ARGUMENTS: [(&str, &str); 4] = [
+const ARGUMENTS: [(&str, &str); 5] = [
+    ("--backend", "backend"),
     ("with --depth-encoding", "by depth_encoding"),
     ("--depth-encoding", "depth_encoding"),
     ("--border-px", "border_px"),

@@ -156,6 +156,12 @@ impl Renderer {
                 tracing::warn!("holograms are computed by {} from now on", state.description);
             }
             let frame_ms = began.elapsed().as_secs_f64() * 1e3;
+            if rendered.clipped_share.0.into_iter().any(|share| share > 0.0) {
+                renderer::check_last_hologram(&mut *state.renderer)?;
+            }
+            if let Some(fault) = renderer::clipping_fault(rendered.clipped_where_lit(self.rig.light())) {
+                tracing::warn!("{fault}");
+            }
             let phase_rad = state.renderer.pattern().map_err(&unavailable)?.phase_rad.clone();
             let field = if field { Some(state.renderer.hologram().map_err(&unavailable)?.field.clone()) } else { None };
             Ok(Made { levels, rendered, phase_rad, field, engine: state.description.clone(), frame_ms })

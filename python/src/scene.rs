@@ -2,8 +2,8 @@
 
 use holod_calibration::Resolution;
 use holod_daemon::failure::{Exit, Failure};
-use holod_daemon::source::scene::SAMPLE_RESOLUTION;
-use holod_model::scene::{DepthEncoding, Fit, MOST_PIXELS, Scene};
+use holod_daemon::source::scene::{SAMPLE_RESOLUTION, warn_of_oddities};
+use holod_model::scene::{DepthEncoding, Fit, FrameReport, MOST_PIXELS, Scene};
 use holod_model::scene_renderer;
 use numpy::PyArrayMethods;
 use pyo3::prelude::*;
@@ -46,6 +46,9 @@ pub(crate) fn read_scene<'py>(
         let encoding = depth_encoding.map(|text| DepthEncoding::parse(text, &geometry)).transpose().map_err(&data)?;
         let scene = Scene::open(path, encoding).map_err(&data)?;
         let mut picture = scene.picture(frame, &geometry, size, fit).map_err(&data)?;
+        // Depths are as they are, in and out of the display's range: `render` clamps them, and warns of it.
+        let report = FrameReport { depth_clamped_far_px: 0, depth_clamped_near_px: 0, ..picture.report };
+        warn_of_oddities(path, &report, &geometry, true);
         picture.linear = interleaved(&picture.linear);
         Ok((scene, picture))
     })?;

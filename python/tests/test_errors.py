@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import subprocess
 import sys
 import threading
@@ -15,6 +17,7 @@ import holod
 import numpy as np
 import pytest
 from conftest import RIG, SIZE
+from PIL import Image
 
 WIDTH, HEIGHT = SIZE
 RGB8 = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
@@ -116,9 +119,18 @@ def test_arrays_that_are_none_are_refused(
 
 
 def test_what_is_refused_above_is_taken_when_it_is_right(renderer: holod.Renderer) -> None:
-    for rgb, colour in [(RGB8, None), (RGB8, "srgb"), (LINEAR, "srgb"), (LINEAR, "linear")]:
-        renderer.render(rgb, METRES, 3.0, colour=colour, depth_unit="metres")
-    expected = renderer.render(RGB8, METRES, 3.0, depth_unit="metres").levels
+    def phases(rgb: np.ndarray, depth: np.ndarray, **options: Any) -> np.ndarray:
+        return renderer.render(rgb, depth, 3.0, **options).phase_rad
+
+    def share_apart(found: np.ndarray, expected: np.ndarray) -> float:
+        return float(np.mean(np.abs(np.exp(1j * found) - np.exp(1j * expected)) > 1e-2))
+
+    expected = phases(RGB8, METRES, depth_unit="metres")
+    same_light = ((RGB8 / np.float32(255) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
+    for rgb, colour in [(RGB8, "srgb"), (RGB8 / np.float32(255), "srgb"), (same_light, "linear")]:
+        assert share_apart(phases(rgb, METRES, colour=colour, depth_unit="metres"), expected) < 1e-3, colour
+    for rgb, colour in [(RGB8 + np.uint8(2), "srgb"), (RGB8 / np.float32(255), "linear"), (same_light, "srgb")]:
+        assert share_apart(phases(rgb, METRES, colour=colour, depth_unit="metres"), expected) > 1e-2, colour
     millimetres = (METRES * 1000).astype(np.uint16)
     for depth, unit in [
         (millimetres, "millimetres"),
@@ -126,10 +138,9 @@ def test_what_is_refused_above_is_taken_when_it_is_right(renderer: holod.Rendere
         (1 / METRES, "dioptres"),
         ((1 / METRES) * np.float32(0.35), "normalised_dioptres"),
     ]:
-        found = renderer.render(RGB8, depth, 3.0, depth_unit=unit).levels.astype(int)
-        assert np.mean(found != expected) < 1e-3, unit
-    other = renderer.render(RGB8, METRES, 3.0, depth_unit="dioptres").levels
-    assert np.mean(other != expected) > 1e-3
+        assert share_apart(phases(RGB8, depth, depth_unit=unit), expected) < 1e-3, unit
+    for other, unit in [(METRES, "dioptres"), (METRES * np.float32(1.05), "metres")]:
+        assert share_apart(phases(RGB8, other, depth_unit=unit), expected) > 1e-2, unit
     filled = renderer.render(RGB8, changed(METRES, (4, 5), np.nan), 3.0, depth_unit="metres", fill_missing=True)
     assert filled.depth_missing_px == 1
 
@@ -417,3 +428,65 @@ def test_scenes_are_compared_and_hashed_as_objects(scene: holod.Scene) -> None:
     assert scene == scene
     assert scene != other
     assert len({scene, other}) == 2
+
+
+def rewritten_weights(folder: Path, *, number: float | None = None, amplitude_constant: float | None = None) -> Path:
+    """The built-in `fast` with every number exchanged, or with another amplitude constant."""
+    file = (Path(__file__).parents[2] / "model/weights/fast.safetensors").read_bytes()
+    header_end = 8 + int.from_bytes(file[:8], "little")
+    header, numbers = file[:header_end], file[header_end:]
+    if number is not None:
+        numbers = np.full(len(numbers) // 4, number, np.float32).tobytes()
+    if amplitude_constant is not None:
+        before = header
+        header = header.replace(
+            b'amplitude_constant\\": 1.25', f'amplitude_constant\\": {amplitude_constant:.2f}'.encode()
+        )
+        assert len(header) == len(before) and header != before
+    path = folder / "weights.safetensors"
+    path.write_bytes(header + numbers)
+    return path
+
+
+def test_holograms_that_are_no_numbers_are_refused_and_clipped_ones_warned_of(tmp_path: Path) -> None:
+    def render(weights: Path) -> holod.Hologram:
+        renderer = holod.Renderer(weights=weights, width_px=WIDTH, height_px=HEIGHT, backend="cpu")
+        return renderer.render(RGB8, METRES, 3.0, depth_unit="metres")
+
+    with pytest.raises(holod.InputError, match="values are no finite numbers"):
+        render(rewritten_weights(tmp_path, number=1e30))
+    with pytest.warns(holod.HolodWarning, match="above the amplitude_constant of the weights, and were clipped"):
+        clipped = render(rewritten_weights(tmp_path, amplitude_constant=0.01))
+    assert clipped.clipped_share > 0.5
+
+
+def test_what_the_daemon_warns_of_in_a_scene_is_warned_of(tmp_path: Path) -> None:
+    Image.fromarray(RGB8).save(tmp_path / "colour.png")
+    depth_mm = np.zeros((HEIGHT, WIDTH), np.uint16)
+    depth_mm[:20] = 500
+    Image.fromarray(depth_mm).save(tmp_path / "depth.png")
+    named = f"{tmp_path}/colour.png,{tmp_path}/depth.png"
+    with pytest.warns(holod.HolodWarning, match="depths .* are missing and were filled from their surroundings"):
+        holod.load_scene(named, depth_encoding="millimetres")
+
+
+def test_a_display_server_that_hangs_is_not_asked_for_the_graphics_processor(tmp_path: Path) -> None:
+    """A layer of Mesa's Vulkan asks it where nobody forbids that."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "wayland-0"))
+        server.listen()
+        make = "import holod; print(holod.Renderer(weights='fast', width_px=64, height_px=64).engine)"
+        environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "WAYLAND_DISPLAY": "wayland-0"}
+        environment.pop("NODEVICE_SELECT", None)
+        made = subprocess.run(
+            [sys.executable, "-c", make], env=environment, capture_output=True, timeout=60, check=True
+        )
+    assert made.stdout
+
+
+def test_errors_name_this_packages_arguments(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG + 'gpu = "a card that nobody has"\n')
+    with pytest.raises(holod.UnavailableError, match=r"^backend gpu: ") as told:
+        holod.Renderer(holod.Rig.load(path), "fast", width_px=64, height_px=64, backend="gpu")
+    assert "--backend" not in str(told.value)

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use holod_tests::daemon::{Daemon, Ended, wait_until};
-use holod_tests::{frames, small_rig};
+use holod_tests::{diverged_weights, frames, small_rig};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
@@ -382,12 +382,14 @@ fn what_cannot_be_done_is_said_and_changes_nothing() {
     let before = bench.status();
     let scene = "colour = \"colour.png\"\ndepth = \"depth.png\"\ndepth_encoding = \"metres\"\n";
     fs::write(bench.path().join("scene.toml"), scene).unwrap();
+    fs::write(bench.path().join("diverged.safetensors"), diverged_weights()).unwrap();
     for (args, said) in [
         (&["scene", "absent"][..], "absent"),
         (&["scene", ".", "--depth-encoding", "dioptres"], "scene.toml, line 3: `depth_encoding`: found metres here"),
         (&["scene", "feed"], "start it with --scene feed"),
         (&["weights", "./absent.safetensors"], "absent.safetensors"),
         (&["pupil", "12"], "expected a human pupil of 0.5 to 9 mm"),
+        (&["weights", "./diverged.safetensors"], "values are no finite numbers"),
         (&["weights", "smal"], "did you mean `small`?"),
         (&["eye", "third"], "expected left, right, both or better"),
         (&["pattern", "level", "256"], "expected 0 to 255, the panel's levels"),

@@ -8,8 +8,8 @@ use holod_pupil_input::wire::line::{LineSample, encode_line};
 use holod_pupil_input::{MockSource, Scenario, host_now};
 use holod_slm_output::laser::simulator::{Faults, SimulatedBox, SimulatedTerminal};
 use holod_tests::daemon::{Daemon, Ended, run, wait_until};
-use holod_tests::small_rig;
 use holod_tests::tracker::{PtyTracker, TimedLine};
+use holod_tests::{diverged_weights, small_rig};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -463,6 +463,26 @@ fn amplitudes_that_double_phase_clips_are_told_once() {
     for command in ["run", "render"] {
         assert_eq!((told(command, "dim.safetensors"), told(command, "fast")), (1, 0), "{command}");
     }
+}
+
+#[test]
+fn weights_that_give_no_numbers_are_taken_by_nothing() {
+    let folder = holod_tests::new_folder();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    fs::write(folder.path().join("diverged.safetensors"), diverged_weights()).unwrap();
+    let ended = |command: &[&str], weights: &str| {
+        run(HOLOD, &[command, &["--config", "rig.toml", "--weights", weights]].concat(), folder.path())
+    };
+    let check = ["check", "--resolution", "64x64"];
+    let live = ["run", "--tracker", "mock", "--resolution", "64x64", "--frames", "3"];
+    let render = ["render", "--pupil", "3", "--resolution", "64x64", "--out", "out"];
+    for command in [&check[..], &live, &render] {
+        let refused = ended(command, "diverged.safetensors");
+        let said = format!("{}{}", refused.stdout, refused.stderr);
+        assert!(!refused.status.success() && said.contains("values are no finite numbers"), "{command:?}: {said}");
+    }
+    let taken = ended(&live, "fast");
+    assert!(taken.status.success(), "{}", taken.stderr);
 }
 
 #[test]

@@ -28,6 +28,20 @@ pub fn shared_data() -> PathBuf {
     std::env::var_os("HOLOD_SHARED_DATA").map_or_else(beside, PathBuf::from)
 }
 
+/// The built-in weights `fast`, of which every number is so large that holograms are none.
+///
+/// # Panics
+/// Where the weights are not there.
+pub fn diverged_weights() -> Vec<u8> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../model/weights/fast.safetensors");
+    let mut file = std::fs::read(path).expect("the built-in weights");
+    let header_bytes = u64::from_le_bytes(file[..8].try_into().expect("eight bytes")) as usize;
+    for number in file[8 + header_bytes..].chunks_exact_mut(4) {
+        number.copy_from_slice(&1e30f32.to_le_bytes());
+    }
+    file
+}
+
 const MEMORY: &str = "/dev/shm";
 /// More than what the tests that run at one time leave in their folders.
 const MEMORY_BYTES: u64 = 1 << 28;

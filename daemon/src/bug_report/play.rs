@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 use holod_calibration::rig::{LaserDriver, Rig, WeightsChoice};
 use holod_calibration::{Resolution, TimeNs};
 use holod_model::RgbdFrame;
+use holod_model::gpu::{self, Adapters};
 use holod_model::scene::Scene;
 use holod_slm_output::LevelsFrame;
 use holod_slm_output::output::DarkSwitch;
@@ -25,7 +26,7 @@ use crate::failure::{Exit, Failure};
 use crate::record::{
     BENCH, FRAMES, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile, content_xxh3,
 };
-use crate::renderer::{self, Use};
+use crate::renderer::{self, PLAYS_A_GPU, Use};
 use crate::session::{Cue, Playback};
 use crate::source::Pictures;
 use crate::source::scene::{self, Frames};
@@ -50,17 +51,16 @@ pub struct Played {
     pub comparison: Comparison,
 }
 
-/// The backend that computes as the engine of that description did, or `Auto` where it was a GPU and there is none.
-fn like(engine: &str, there_is_a_gpu: impl FnOnce() -> bool) -> Backend {
-    let half = engine.contains("half precision");
-    if engine.starts_with("cpu") {
-        if half { Backend::CpuHalf } else { Backend::Cpu }
-    } else if !there_is_a_gpu() {
-        Backend::Auto
-    } else if half {
-        Backend::GpuHalf
-    } else {
-        Backend::Gpu
+/// The backend that computes as the engine of that description did, in its precision: on the processor where it was a
+/// GPU of which there is none here. `there_are` says whether one of such devices can be opened.
+fn like(engine: &str, there_are: impl Fn(Adapters) -> bool) -> Backend {
+    let on_gpu = !engine.starts_with("cpu")
+        && (there_are(Adapters::Hardware) || engine.contains(PLAYS_A_GPU) && there_are(Adapters::Software));
+    match (on_gpu, engine.contains("half precision")) {
+        (false, false) => Backend::Cpu,
+        (false, true) => Backend::CpuHalf,
+        (true, false) => Backend::Gpu,
+        (true, true) => Backend::GpuHalf,
     }
 }
 
@@ -99,7 +99,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
         )));
     }
     let backend = match backend {
-        Backend::Auto => like(&facts.engine, || holod_model::gpu::find().is_ok()),
+        Backend::Auto => like(&facts.engine, |adapters| gpu::find(adapters).is_ok()),
         asked => asked,
     };
     if facts.holod != env!("HOLOD_VERSION") {
@@ -517,12 +517,18 @@ mod tests {
 
     #[test]
     fn frames_are_made_again_as_they_were_made_where_that_can_be() {
-        let [with, without] = [true, false].map(|there| move |engine| like(engine, || there));
+        let [with, software, without] = [&[Adapters::Hardware, Adapters::Software][..], &[Adapters::Software], &[]]
+            .map(|there| move |engine| like(engine, |adapters| there.contains(&adapters)));
         assert_eq!([with("cpu, avx2, 2 threads"), without("cpu, avx2, 2 threads")], [Backend::Cpu; 2]);
         assert_eq!(with("cpu, avx512 in half precision, 2 threads"), Backend::CpuHalf);
         assert_eq!(with("gpu, X, single precision"), Backend::Gpu);
         assert_eq!(with("gpu, X, matrix units, half precision"), Backend::GpuHalf);
-        assert_eq!(without("gpu, X, single precision"), Backend::Auto);
+        for there in [software, without] {
+            assert_eq!(there("gpu, X, single precision"), Backend::Cpu);
+            assert_eq!(there("gpu, X, matrix units, half precision"), Backend::CpuHalf);
+        }
+        let played = format!("gpu, Y, single precision, {PLAYS_A_GPU}");
+        assert_eq!([software(&played), without(&played)], [Backend::Gpu, Backend::Cpu]);
     }
 
     #[test]

@@ -146,7 +146,7 @@ pub(super) fn compute(
     if let Some(fault) = renderer::clipping_fault(clipped_share) {
         tracing::warn!("{fault}");
     }
-    renderer::check_numbers(renderer.hologram().map_err(Failure::because(Exit::Unavailable))?)?;
+    renderer::check_last_hologram(&mut *renderer)?;
     let done = &frames.reports[0];
     let [depth_least_dpt, depth_greatest_dpt] = done.depth_range.map(|depth| rig.geometry.depth_at(f64::from(depth)).0);
     let report = Report {

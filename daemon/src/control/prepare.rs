@@ -220,7 +220,8 @@ impl Preparer {
         Ok(NewEngine { renderer, trained: weights.trained_pupils(&rig.geometry), weights: choice })
     }
 
-    /// Makes two frames, of which the first may be slow, beside those of the loop; how long the second took.
+    /// Makes two frames, of which the first may be slow, beside those of the loop; how long the second took. A hologram
+    /// that is no numbers is refused.
     fn warm_up(&self, renderer: &mut dyn Renderer, weights: &Weights) -> Result<TimeNs, String> {
         let mut levels = LevelsFrame::new(self.encoder.layout());
         let [pupil, _] = weights.trained_pupils(&self.rig.geometry);
@@ -229,7 +230,9 @@ impl Preparer {
             began = host_now();
             renderer.render(&self.frame, pupil, &mut levels).map_err(|error| error.to_string())?;
         }
-        Ok(host_now() - began)
+        let taken = host_now() - began;
+        renderer::check_last_hologram(renderer).map_err(in_words)?;
+        Ok(taken)
     }
 }
 

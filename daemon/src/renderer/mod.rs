@@ -211,7 +211,7 @@ pub fn panel_encoder(rig: &Rig, resolution: Resolution) -> Result<Arc<PanelEncod
 const MUCH_CLIPPED: f32 = 0.05;
 
 /// What is wrong with a hologram of which so large a share of all amplitudes was clipped by double phase.
-pub(crate) fn clipping_fault(clipped_share: f32) -> Option<String> {
+pub fn clipping_fault(clipped_share: f32) -> Option<String> {
     (clipped_share > MUCH_CLIPPED).then(|| {
         format!(
             "{:.0} % of a hologram's amplitudes are above the amplitude_constant of the weights, and were clipped: bright \
@@ -219,6 +219,14 @@ pub(crate) fn clipping_fault(clipped_share: f32) -> Option<String> {
             100.0 * clipped_share
         )
     })
+}
+
+/// Refuses the hologram of the last frame where it is no numbers, as [`check_numbers`] does.
+///
+/// # Errors
+/// A value is not finite, or the device that has it failed.
+pub fn check_last_hologram(renderer: &mut dyn Renderer) -> Result<(), Failure> {
+    check_numbers(renderer.hologram().map_err(Failure::because(Exit::Unavailable))?)
 }
 
 /// Refuses a hologram that is no numbers: double phase would make darkness of it.
@@ -282,7 +290,22 @@ pub(crate) mod failing {
     pub(crate) struct Failing {
         /// Of each of the next frames: how long it takes, and whether its engine fails. Those that follow are like the
         /// last.
-        pub(crate) frames: VecDeque<(Duration, bool)>,
+        frames: VecDeque<(Duration, bool)>,
+        hologram: ComplexHologram,
+    }
+
+    impl Failing {
+        pub(crate) fn new(frames: &[(Duration, bool)]) -> Self {
+            let hologram = ComplexHologram::dark(Resolution { width: 2, height: 2 });
+            Self { frames: frames.iter().copied().collect(), hologram }
+        }
+
+        /// Whose holograms are no numbers.
+        pub(crate) fn diverged() -> Self {
+            let mut renderer = Self::new(&[(Duration::ZERO, false)]);
+            renderer.hologram.field[5].im = f32::NAN;
+            renderer
+        }
     }
 
     impl Renderer for Failing {
@@ -301,7 +324,7 @@ pub(crate) mod failing {
         }
 
         fn hologram(&mut self) -> Result<&ComplexHologram, EngineError> {
-            unreachable!("nobody asks for it")
+            Ok(&self.hologram)
         }
 
         fn pattern(&mut self) -> Result<&PhasePattern, EngineError> {

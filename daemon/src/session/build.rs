@@ -321,7 +321,8 @@ fn open_output(plan: &SessionPlan, encoder: &PanelEncoder, options: OutputOption
 }
 
 /// How long a frame takes, measured before anything is shown: the second one, unless the first took very long. A GPU's
-/// driver still prepares things while it does the first. One in which an engine failed tells the time of that.
+/// driver still prepares things while it does the first. One in which an engine failed tells the time of that. A hologram
+/// that is no numbers is refused.
 fn first_frame_time(
     renderer: &mut dyn Renderer,
     frame: &Arc<RgbdFrame>,
@@ -340,6 +341,7 @@ fn first_frame_time(
     while engine_failed {
         (taken, engine_failed) = time()?;
     }
+    renderer::check_last_hologram(renderer)?;
     Ok(taken)
 }
 
@@ -358,12 +360,12 @@ mod tests {
     use crate::renderer::failing::Failing;
 
     #[test]
-    fn a_frame_in_which_an_engine_fails_tells_no_frame_time() {
+    fn a_frame_in_which_an_engine_fails_tells_no_frame_time_and_one_of_no_numbers_is_refused() {
         let size = Resolution { width: 8, height: 8 };
         let encoder = renderer::panel_encoder(&Rig::default(), size).unwrap();
         let (slow, quick) = (Duration::from_millis(200), Duration::ZERO);
         let frame_time = |frames: &[(Duration, bool)]| {
-            let mut renderer = Failing { frames: frames.iter().copied().collect() };
+            let mut renderer = Failing::new(frames);
             let (frame, levels) = (Arc::new(RgbdFrame::black(size)), LevelsFrame::new(encoder.layout()));
             first_frame_time(&mut renderer, &frame, PupilDiameter::from_mm(3.0), levels).unwrap()
         };
@@ -376,5 +378,8 @@ mod tests {
         ] {
             assert!(frame_time(frames) < TimeNs(200_000_000), "{frames:?}");
         }
+        let (frame, levels) = (Arc::new(RgbdFrame::black(size)), LevelsFrame::new(encoder.layout()));
+        let refused = first_frame_time(&mut Failing::diverged(), &frame, PupilDiameter::from_mm(3.0), levels);
+        assert_eq!(refused.unwrap_err().exit, Exit::Data);
     }
 }

@@ -118,6 +118,7 @@ impl Watch<'_> {
         let NewEngine { renderer, trained, weights } = engine;
         let description = renderer.description().to_owned();
         self.change(Change::Engine(renderer, TrainedPupils::of(trained)))?;
+        self.announced.clipped = false;
         let said = format!("holograms are computed with the weights {}, {description}", setup::weights_name(&weights));
         *self.names.engine.lock().unwrap_or_else(PoisonError::into_inner) = description;
         self.desk.changes.weights.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&weights);

@@ -105,8 +105,8 @@ pub(super) struct Rings {
 pub(super) struct Announced {
     /// What would bring more frames a second has been said.
     advised: bool,
-    /// So has that much of a hologram is clipped.
-    clipped: bool,
+    /// So has, of the weights in use, that much of a hologram is clipped.
+    pub(super) clipped: bool,
     rate: RateWatch,
     state: State,
     text: String,

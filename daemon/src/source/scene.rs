@@ -206,6 +206,12 @@ pub fn warn_of_oddities(name: &str, report: &FrameReport, geometry: &DisplayGeom
     if let Some(oddity) = depth_oddity(report, geometry, is_plane) {
         tracing::warn!("{name}: {oddity}");
     }
+    if let Some(orientations) = report.turned_apart {
+        tracing::warn!("{name}: {}", odd_turns(orientations));
+    }
+    if report.has_foreign_primaries {
+        warn_of_foreign_primaries(name);
+    }
     warn_of_clipped_colours(name, report.colour_clipped, source.pixels());
 }
 

@@ -47,15 +47,18 @@ pub(crate) enum MatrixUnits {
     Threads,
 }
 
-/// The name of the graphics processor that an engine would take.
+/// The name of the device among `adapters` that an engine would take.
 ///
 /// # Errors
 /// There is none that can be opened.
-pub fn find() -> Result<String, GpuError> {
+pub fn find(adapters: Adapters) -> Result<String, GpuError> {
     #[cfg(feature = "gpu")]
-    return Gpu::open(Adapters::Hardware.into(), false).map(|gpu| gpu.name().to_owned());
+    return Gpu::open(adapters.into(), false).map(|gpu| gpu.name().to_owned());
     #[cfg(not(feature = "gpu"))]
-    Err(GpuError::NotBuilt)
+    {
+        let _ = adapters;
+        Err(GpuError::NotBuilt)
+    }
 }
 
 thread_local! {

@@ -18,12 +18,19 @@ blue; pictures are (rows, columns, 3), phases and levels (3, rows, columns). Not
 another shape or type, or a value that is none, raises InputError, which says what was found and expected.
 """
 
+import os
+
 from holod_client import Control, ControlError, Feed, FeedError, FeedTimeoutError, UnansweredError
 
 from holod._holod import Hologram, Renderer, Rig, evaluate, to_srgb8, view
 from holod.errors import HolodError, HolodWarning, InputError, RigError, UnavailableError
 from holod.log import Blink, PupilLog, read_log
 from holod.scene import Scene, builtin_scene, load_scene
+
+# Before a renderer opens Vulkan: a layer of Mesa's would ask the desktop which graphics processor it uses, and wait
+# without end for a display server that hangs.
+if "MESA_VK_DEVICE_SELECT" not in os.environ:
+    os.environ.setdefault("NODEVICE_SELECT", "1")
 
 __all__ = [
     "Blink",
