@@ -75,6 +75,11 @@ impl DisplayGeometry {
         PupilDiameter::from_mm((blur_px * self.pixel_angle_rad() / self.volume().0 * 1e3) as f32)
     }
 
+    /// By how much a pupil must change for the largest circle of confusion to change by an angle: φ/V.
+    pub fn pupil_step_of_blur(&self, angle_rad: f64) -> Metres {
+        Metres(angle_rad / self.volume().0)
+    }
+
     /// The depth range V, from its far end to its near end.
     pub fn volume(&self) -> Dioptres {
         self.depth_near - self.depth_far

@@ -164,6 +164,7 @@ fn figures_in_another_unit_are_recognised() {
         ("depth_far_m = inf", "depth_far_m = 2000", "optics.depth_far_m", "looks like millimetres: write 2 "),
         ("depth_near_m = 0.35", "depth_near_m = 350", "optics.depth_near_m", "looks like millimetres: write 0.35 "),
         ("hold_ms = 1000.0", "hold_ms = 1", "tracker.hold_ms", "looks like seconds: write 1000 "),
+        ("network = \"standard\"", "pupil_step_mm = 50", "model.pupil_step_mm", "looks like micrometres: write 0.05 "),
     ] {
         check(from, to, key, "", "a number from", advice);
     }
@@ -1539,12 +1540,33 @@ fn meaning_is_readable_and_becomes_json() {
         "pupil 4 mm     blur up to 57.1 px; needs 50.0 mrad, of the panel's band red 1.25, green 1.54, blue 1.78",
         "at 60 Hz: red, green, blue in the channels red, green, blue, 5.556 ms each, 60.0 colour frames a second",
         "settled at 2.000 ms, laser on at 2.100, off at 5.100: lit for 54 % of it",
+        "pupil step     0.102 mm, 1.45 px of the largest blur: what moves less keeps its hologram",
     ] {
         assert!(text.contains(part), "{part} is not in\n{text}");
     }
     let json = serde_json::to_value(&meaning).unwrap();
     assert_eq!(json["eyebox_mm"]["red"].as_f64(), Some(meaning.eyebox_mm.red));
     assert_eq!(json["depth_far_m"], serde_json::Value::Null);
+}
+
+#[test]
+fn the_pupil_step_is_an_arc_minute_of_blur_where_the_rig_says_nothing_else() {
+    let parse = |text: &str| Rig::parse(text, Path::new("")).unwrap();
+    let derived = parse(Rig::BUILT_IN_TOML);
+    assert_eq!(derived.model.pupil_step, None);
+    // 1' is 0.2909 mrad, of a pixel 0.2; half the depth range is blurred half as much.
+    let blur_rad = derived.pupil_step().0 * derived.geometry.volume().0;
+    assert!((blur_rad - 2.908_882e-4).abs() < 1e-9, "{blur_rad}");
+    let shallow = parse(&changed(&[("depth_near_m = 0.35", "depth_near_m = 0.7")]));
+    assert!((shallow.pupil_step().0 / derived.pupil_step().0 - 2.0).abs() < 1e-9);
+    for (step, meters, says) in [
+        ("0.05", 0.05e-3, "pupil step     0.050 mm, 0.71 px of the largest blur"),
+        ("0", 0.0, "pupil step     none: each hologram is made for the pupil of its own time"),
+    ] {
+        let rig = parse(&changed(&[("[model]", &format!("[model]\npupil_step_mm = {step}"))]));
+        assert_eq!(rig.pupil_step().0, meters);
+        assert!(rig.meaning().to_string().contains(says), "{}", rig.meaning());
+    }
 }
 
 #[test]

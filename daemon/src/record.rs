@@ -35,8 +35,10 @@ pub struct FrameRecord {
     pub t_sample: Option<TimeNs>,
     /// That sample's diameter as measured, scaled to millimetres.
     pub pupil_raw_mm: Option<f32>,
-    /// The estimate for the time at which the frame's light arrives, for which the hologram was computed.
+    /// The pupil that the hologram was computed for.
     pub pupil: PupilDiameter,
+    /// The tracker's estimate for the time at which the frame's light arrives, where that is followed.
+    pub pupil_estimate: Option<PupilDiameter>,
     /// Name of the estimator's state.
     pub pupil_state: &'static str,
     /// The loop woke for this frame.
@@ -70,6 +72,7 @@ impl FrameRecord {
             t_sample: None,
             pupil_raw_mm: None,
             pupil,
+            pupil_estimate: Some(pupil),
             pupil_state: "tracking",
             t_wake: t,
             t_render_begin: t,

@@ -10,7 +10,7 @@ use holod_pupil_input::wire::line::{LineSample, encode_line};
 use holod_pupil_input::{
     GateSettings, MOCK_SEED, MockSource, PupilSample, Recording, STATED_LAG, SampleEye, Scenario, host_now,
 };
-use holod_tests::daemon::{Daemon, wait_until};
+use holod_tests::daemon::{Daemon, run, wait_until};
 use holod_tests::frames::{self, FieldRow};
 use holod_tests::tracker::{PtyTracker, TimedLine};
 use holod_tests::{FIELD_ORDER, small_rig};
@@ -94,9 +94,87 @@ fn judge(rows: &[FieldRow], summary: &serde_json::Value) {
         rows.iter().filter(|row| row.deadline_missed).map(|row| row.frame).collect::<std::collections::BTreeSet<_>>();
     assert_eq!(summary["deadline_misses"], missed.len());
     assert_eq!(summary["records_lost"], 0);
+    assert_eq!(steps(rows).faults, Vec::<String>::new());
 }
 
-/// The largest and the median error of what frames were made for, over those that were shown when they were meant to be
+/// An arc minute of blur on the depth range of [`small_rig`], millimetres of pupil.
+const PUPIL_STEP_MM: f64 = 0.101_811;
+
+/// How holograms followed the estimate: those that were made for another pupil than the one before, and what is not by
+/// the rule.
+struct Steps {
+    count: usize,
+    faults: Vec<String>,
+}
+
+fn steps(rows: &[FieldRow]) -> Steps {
+    let mut steps = Steps { count: 0, faults: Vec::new() };
+    let mut before: Option<&FieldRow> = None;
+    for row in rows {
+        let Some(estimate_mm) = row.pupil_estimate_mm else { continue };
+        let is_new = before.is_none_or(|before| before.pupil_mm != row.pupil_mm);
+        let is_other_frame = before.is_some_and(|before| before.frame + 1 == row.frame);
+        let moved_mm = before.map(|before| (estimate_mm - before.pupil_mm).abs());
+        steps.count += usize::from(is_new && before.is_some());
+        let is_held = (estimate_mm - row.pupil_mm).abs() <= PUPIL_STEP_MM;
+        let is_exact = !is_new || estimate_mm == row.pupil_mm;
+        // In the fallback, which has no noise, each is made for its own.
+        let is_due = !is_new || !is_other_frame || row.pupil_state == "fallback" || moved_mm > Some(PUPIL_STEP_MM);
+        if !(is_held && is_exact && is_due) {
+            steps.faults.push(format!("frame {}: {} mm for an estimate of {estimate_mm}", row.frame, row.pupil_mm));
+        }
+        before = Some(row);
+    }
+    steps
+}
+
+#[test]
+fn an_eye_that_rests_keeps_its_hologram_and_a_reflex_is_followed_at_once() {
+    let record = |more: &str| {
+        let folder = holod_tests::new_folder();
+        let rig = format!("{}[model]\nnetwork = \"fast\"\n{more}", small_rig(64, 64, "driver = \"simulated\""));
+        fs::write(folder.path().join("rig.toml"), rig).unwrap();
+        let eye = "rate 200\nnoise 0.05mm\nhippus 0mm\n0s pupil 4mm\n4s pupil 2.5mm\n";
+        fs::write(folder.path().join("eye.txt"), eye).unwrap();
+        let args = ["--config", "rig.toml", "--tracker", "mock:eye.txt", "--resolution", "64x64", "--record", "record"];
+        let ended = run(HOLOD, &[&args[..], &["--duration", "7s"]].concat(), folder.path());
+        assert!(ended.status.success(), "{}", ended.stderr);
+        let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap();
+        let t_first = TimeNs(rows[0].t_present_ns);
+        let part = |from_s: i64, to_s: i64| -> Vec<FieldRow> {
+            let within = |row: &&FieldRow| (from_s..to_s).contains(&((row.t_present_ns - t_first.0) / 1_000_000_000));
+            rows.iter().filter(within).cloned().collect()
+        };
+        [part(1, 4), part(4, 6), rows]
+    };
+    let patterns = |rows: &[FieldRow]| {
+        let mut hashes: Vec<_> = rows.iter().map(|row| &row.levels_xxh3).collect();
+        hashes.dedup();
+        hashes.len()
+    };
+    let frames = |rows: &[FieldRow]| {
+        let mut frames: Vec<_> = rows.iter().map(|row| row.frame).collect();
+        frames.dedup();
+        frames.len()
+    };
+    let [rests, reacts, all] = record("");
+    assert_eq!(steps(&all).faults, Vec::<String>::new());
+    // Each hologram is of its pupil: another one only with that.
+    assert_eq!(patterns(&all), steps(&all).count + 1);
+    assert!(patterns(&rests) * 6 <= frames(&rests), "{} of {}", patterns(&rests), frames(&rests));
+    // 1.5 mm in steps of a tenth at least.
+    assert!(steps(&reacts).count >= 5, "{}", steps(&reacts).count);
+    let last_mm = all[all.len() - 1].pupil_mm;
+    assert!((last_mm - 2.5).abs() < 0.3, "{last_mm} mm");
+
+    let [rests, _, all] = record("pupil_step_mm = 0\n");
+    assert!(all.iter().all(|row| row.pupil_estimate_mm.is_none_or(|estimate_mm| estimate_mm == row.pupil_mm)));
+    assert!(patterns(&rests) * 2 > frames(&rests), "{} of {}", patterns(&rests), frames(&rests));
+    let judged = steps(&all);
+    assert!(judged.faults.len() > 20, "the judge must object to holograms that follow the noise");
+}
+
+/// The largest and the median error of what the pupil is estimated to be when frames are seen, over those that were shown when they were meant to be
 /// (a frame that stays on the panel because the machine is slow says nothing about the estimate): the distance to the
 /// nearest of the eye's diameters between the filter's stated lag before the frame's light and that light. `delay`
 /// shifts the eye, for a canary.
@@ -109,7 +187,8 @@ fn errors(rows: &[FieldRow], t_first: TimeNs, delay: TimeNs, truth_mm: impl Fn(T
         .filter_map(|(_, row)| {
             let t = TimeNs(row.laser_on_ns?) - t_first - delay;
             let lagged = (0..=STATED_LAG.0 / 5_000_000).filter_map(|step| truth_mm(t - TimeNs(step * 5_000_000)));
-            lagged.map(|truth| (row.pupil_mm - truth).abs()).min_by(f64::total_cmp)
+            let estimate_mm = row.pupil_estimate_mm?;
+            lagged.map(|truth| (estimate_mm - truth).abs()).min_by(f64::total_cmp)
         })
         .collect();
     errors.sort_by(f64::total_cmp);

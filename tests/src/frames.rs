@@ -14,6 +14,7 @@ pub struct FieldRow {
     pub t_sample_ns: Option<i64>,
     pub pupil_raw_mm: Option<f64>,
     pub pupil_mm: f64,
+    pub pupil_estimate_mm: Option<f64>,
     pub pupil_state: String,
     pub t_wake_ns: i64,
     pub t_render_begin_ns: i64,
@@ -29,6 +30,7 @@ pub struct FieldRow {
     pub picture_focus_dpt: Option<f64>,
     pub picture_fov_x_deg: Option<f64>,
     pub picture_fov_y_deg: Option<f64>,
+    pub levels_xxh3: String,
 }
 
 /// Reads every row of a record.
@@ -66,6 +68,7 @@ fn row(cells: &HashMap<&str, &str>) -> Result<FieldRow, String> {
         t_sample_ns: cell(cells, "t_sample_ns")?,
         pupil_raw_mm: cell(cells, "pupil_raw_mm")?,
         pupil_mm: needed(cells, "pupil_mm")?,
+        pupil_estimate_mm: cell(cells, "pupil_estimate_mm")?,
         pupil_state: needed(cells, "pupil_state")?,
         t_wake_ns: needed(cells, "t_wake_ns")?,
         t_render_begin_ns: needed(cells, "t_render_begin_ns")?,
@@ -81,6 +84,7 @@ fn row(cells: &HashMap<&str, &str>) -> Result<FieldRow, String> {
         picture_focus_dpt: cell(cells, "picture_focus_dpt")?,
         picture_fov_x_deg: cell(cells, "picture_fov_x_deg")?,
         picture_fov_y_deg: cell(cells, "picture_fov_y_deg")?,
+        levels_xxh3: cell(cells, "levels_xxh3")?.unwrap_or_default(),
     })
 }
 
@@ -160,6 +164,7 @@ mod tests {
                     t_sample_ns: Some(1),
                     pupil_raw_mm: Some(3.0),
                     pupil_mm: 3.0,
+                    pupil_estimate_mm: Some(3.0),
                     pupil_state: "tracking".into(),
                     t_wake_ns: 10,
                     t_render_begin_ns: 20,
@@ -175,6 +180,7 @@ mod tests {
                     picture_focus_dpt: None,
                     picture_fov_x_deg: None,
                     picture_fov_y_deg: None,
+                    levels_xxh3: String::new(),
                 }
             })
             .collect()

@@ -44,7 +44,7 @@ impl Rig {
             accept_no_heartbeat,
         } = lasers;
         let Tracker { spec, eye, scale, fallback, hold } = tracker;
-        let Model { weights, gpu } = model;
+        let Model { weights, gpu, pupil_step } = model;
         // Without margins the video frame is the panel.
         let is_framed = [*video_margins, other.panel.video_margins] != [VideoMargins::default(); 2];
         let video = video_margins.around(*resolution);
@@ -93,6 +93,7 @@ impl Rig {
             ("tracker.hold_ms", *hold == other.tracker.hold),
             ("model.network", *weights == other.model.weights),
             ("model.gpu", *gpu == other.model.gpu),
+            ("model.pupil_step_mm", *pupil_step == other.model.pupil_step),
         ]
         .into_iter()
         .filter_map(|(key, same)| (!same).then_some(key))
@@ -118,6 +119,7 @@ mod tests {
             ("red = 638.0", "red = 633.0", &["optics.wavelengths_nm"]),
             ("eye = \"both\"", "eye = \"left\"", &["tracker.eye"]),
             ("network = \"standard\"", "network = \"small\"", &["model.network"]),
+            ("[model]", "[model]\npupil_step_mm = 0", &["model.pupil_step_mm"]),
             ("depth_near_m = 0.35", "depth_near_m = 0.25", &["optics.depth_near"]),
         ] {
             let text = Rig::BUILT_IN_TOML.replacen(found, instead, 1);

@@ -82,6 +82,10 @@ pub struct Meaning {
     pub lasers: LaserMeaning,
     /// The tracker, and what holds without it.
     pub tracker: TrackerMeaning,
+    /// By how much a pupil must move until holograms are made for another one.
+    pub pupil_step_mm: f64,
+    /// The largest change of blur that is left to that.
+    pub pupil_step_px: f64,
     /// Bits of one level.
     pub bit_depth: u8,
     /// Where these bits travel on the video link.
@@ -240,6 +244,8 @@ impl Meaning {
             field: FieldMeaning::of(rig),
             lasers: LaserMeaning::of(&rig.lasers),
             tracker: TrackerMeaning::of(&rig.tracker),
+            pupil_step_mm: rig.pupil_step().0 * 1e3,
+            pupil_step_px: geometry.largest_coc_px(PupilDiameter::from_mm((rig.pupil_step().0 * 1e3) as f32)),
             bit_depth: rig.panel.bit_depth,
             packing: rig.panel.packing.name().into(),
             files: active_files(rig),
@@ -657,6 +663,15 @@ impl fmt::Display for Meaning {
             field.lit_share * 100.0
         )?;
         write!(f, "{}{}", self.lasers, self.tracker)?;
+        if self.pupil_step_mm == 0.0 {
+            writeln!(f, "pupil step     none: each hologram is made for the pupil of its own time")?;
+        } else {
+            writeln!(
+                f,
+                "pupil step     {:.3} mm, {:.2} px of the largest blur: what moves less keeps its hologram",
+                self.pupil_step_mm, self.pupil_step_px
+            )?;
+        }
         writeln!(f, "levels         {} bits, packing {}", self.bit_depth, self.packing)?;
         if self.files.is_empty() {
             writeln!(f, "files          none: phase is linear in the level, and the panel is taken as flat")?;

@@ -313,6 +313,8 @@ pub struct Model {
     pub weights: WeightsChoice,
     /// The GPU that computes them, by a part of its name or its place on the PCI bus; the best one where none is named.
     pub gpu: Option<String>,
+    /// [`Rig::pupil_step`], where the rig says one.
+    pub pupil_step: Option<Metres>,
 }
 
 /// A network's weights by name or by file.
@@ -344,6 +346,18 @@ impl WeightsChoice {
     /// The names of the built-in networks in a rig file and on the command line.
     pub const BUILT_IN: [(&'static str, Self); 3] =
         [("standard", Self::Standard), ("small", Self::Small), ("fast", Self::Fast)];
+}
+
+/// What an eye of normal acuity resolves: one minute of arc, in radians.
+const ACUITY_RAD: f64 = std::f64::consts::PI / (180.0 * 60.0);
+
+impl Rig {
+    /// Holograms are made for another pupil when the estimate lies farther than this from the one that they were last
+    /// made for: by as much as changes the blur between the two ends of the depth range by what an eye resolves, where
+    /// the rig says nothing else. With 0 each is made for its own estimate.
+    pub fn pupil_step(&self) -> Metres {
+        self.model.pupil_step.unwrap_or_else(|| self.geometry.pupil_step_of_blur(ACUITY_RAD))
+    }
 }
 
 impl Default for Rig {
@@ -388,7 +402,7 @@ impl Default for Rig {
                 fallback: PupilDiameter::from_mm(3.0),
                 hold: TimeNs(1_000_000_000),
             },
-            model: Model { weights: WeightsChoice::Standard, gpu: None },
+            model: Model { weights: WeightsChoice::Standard, gpu: None, pupil_step: None },
             provenance: Provenance::default(),
         }
     }

@@ -84,7 +84,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
         ],
     ),
     ("tracker", &["spec", "eye", "scale_mm_per_unit", "fallback_mm", "hold_ms"]),
-    ("model", &["network", "weights_file", "gpu"]),
+    ("model", &["network", "weights_file", "gpu", "pupil_step_mm"]),
 ];
 
 /// Keys that earlier rig files had, with what to do about them.
@@ -144,6 +144,7 @@ pub(super) const SCALE: Span = Span::new(1e-4, 100.0, "mm per unit").slips(&[("m
 const FALLBACK: Span = Span::new(1.0, 9.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
 /// A sample is judged with its successors, so that none is known sooner.
 const HOLD: Span = Span::new(150.0, 60_000.0, "ms").slips(&[("seconds", 1e3)]);
+const PUPIL_STEP: Span = Span::new(0.0, 1.0, "mm").slips(&[("micrometres", 1e-3)]);
 /// By how much a stated stroke may differ from that of a measured table.
 const STROKE_TOLERANCE: f64 = 0.02;
 
@@ -938,7 +939,12 @@ fn read_model<'a>(reader: &Reader<'a>, model: Section<'a>, folder: &Path) -> Opt
         None => network.map_or(WeightsChoice::Standard, |network| network.value),
     };
     let gpu = reader.text(model, "gpu", "a part of a GPU's name, or its place on the PCI bus");
-    Some(Model { weights, gpu: gpu.map(|gpu| gpu.value.to_owned()) })
+    let step_mm = reader.number(model, "pupil_step_mm", PUPIL_STEP);
+    Some(Model {
+        weights,
+        gpu: gpu.map(|gpu| gpu.value.to_owned()),
+        pupil_step: step_mm.map(|mm| Metres(mm.value / 1e3)),
+    })
 }
 
 fn milliseconds(ms: f64) -> TimeNs {

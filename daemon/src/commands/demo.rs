@@ -196,8 +196,8 @@ fn summary_text(session: &SessionReport, views: &[EyeView]) -> String {
         "holod demo\n\n\
          A simulated eye whose pupil closes to about 2 mm in bright light and opens to about 6 mm in the dark was\n\
          tracked at 200 Hz, blinks included. Each frame's hologram was computed for the pupil expected when its light\n\
-         arrives, double-phase encoded, turned into panel levels and shown on a virtual panel at 60 Hz, colour after\n\
-         colour, each laser lit only over its own field.\n\n\
+         arrives, as nearly as an eye sees of its blur, double-phase encoded, turned into panel levels and shown on a\n\
+         virtual panel at 60 Hz, colour after colour, each laser lit only over its own field.\n\n\
          eye.png                     what the eye sees of the levels that the panel really showed\n\
          phase_<colour>.png          the phase pattern of the widest pupil kept, {phase_mm:.2} mm: black 0, white 2 pi\n\
          pupil.svg                   raw samples, what the gate rejected, the estimate, and the simulated eye's truth\n\
@@ -258,7 +258,8 @@ impl Log {
             .iter()
             .filter_map(|field| {
                 let frame = self.frames.iter().find(|frame| frame.frame == field.frame_id)?;
-                Some((since(field.t_present), f64::from(frame.pupil.mm())))
+                let estimate = frame.pupil_estimate.unwrap_or(frame.pupil);
+                Some((since(field.t_present), f64::from(estimate.mm())))
             })
             .collect();
         let seen: Vec<_> = MockSource::new(SCENARIO, MOCK_SEED)

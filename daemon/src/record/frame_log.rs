@@ -23,7 +23,7 @@ enum Cell {
     Frame(fn(&FrameRecord) -> Option<String>),
 }
 
-const COLUMNS: [(&str, Cell); 25] = [
+const COLUMNS: [(&str, Cell); 26] = [
     ("frame", Field(|field| field.frame.to_string())),
     ("field", Field(|field| field.field.to_string())),
     ("colour", Field(|field| field.colour.to_string())),
@@ -50,6 +50,7 @@ const COLUMNS: [(&str, Cell); 25] = [
     ("picture_focus_dpt", Frame(|frame| frame.picture.view.focus_dpt.map(|dpt| dpt.to_string()))),
     ("picture_fov_x_deg", Frame(|frame| frame.picture.view.field_of_view_deg.map(|[across, _]| across.to_string()))),
     ("picture_fov_y_deg", Frame(|frame| frame.picture.view.field_of_view_deg.map(|[_, up]| up.to_string()))),
+    ("pupil_estimate_mm", Frame(|frame| frame.pupil_estimate.map(|pupil| pupil.mm().to_string()))),
 ];
 
 fn nanoseconds(t: TimeNs) -> String {
@@ -205,6 +206,7 @@ mod tests {
             t_sample: Some(TimeNs(5)),
             pupil_raw_mm: Some(3.25),
             pupil: PupilDiameter::from_mm(3.3),
+            pupil_estimate: Some(PupilDiameter::from_mm(3.25)),
             pupil_state: "tracking",
             t_wake: TimeNs(10),
             t_render_begin: TimeNs(11),
@@ -259,9 +261,9 @@ mod tests {
         let rows: Vec<&str> = text.lines().collect();
         assert_eq!(
             rows[1],
-            "7,1,green,5,3.2500,3.3,tracking,10,11,20,21,30,software,33,36,0,4,3,00000000000000ab,2,0,1,1.25,60,45.5"
+            "7,1,green,5,3.2500,3.3,tracking,10,11,20,21,30,software,33,36,0,4,3,00000000000000ab,2,0,1,1.25,60,45.5,3.25"
         );
-        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,");
+        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,,");
         assert!(rows.iter().all(|row| row.split(',').count() == COLUMNS.len()));
     }
 
@@ -294,7 +296,7 @@ mod tests {
         let rows: Vec<&str> = text.lines().collect();
         let (last, whole) = rows.split_last().unwrap();
         assert!((100..row).contains(&(whole.len() as u64)), "{} of {row}", whole.len());
-        let expected = |number: usize| format!("{number},1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,");
+        let expected = |number: usize| format!("{number},1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,,");
         assert!(whole.iter().enumerate().all(|(number, row)| **row == expected(number)), "{text}");
         assert!(expected(whole.len()).starts_with(last), "{last}");
     }

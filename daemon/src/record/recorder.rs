@@ -445,6 +445,7 @@ mod tests {
             t_sample: None,
             pupil_raw_mm: None,
             pupil: PupilDiameter::from_mm(3.0),
+            pupil_estimate: None,
             pupil_state: "tracking",
             t_wake: TimeNs(1),
             t_render_begin: TimeNs(2),

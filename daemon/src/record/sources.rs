@@ -403,8 +403,10 @@ mod tests {
         assert_eq!(kept.model.weights, WeightsChoice::File(record.join(BENCH).join("weights.safetensors")));
         assert!(fs::read_to_string(record.join(BENCH).join(RIG)).unwrap().contains("# measured"));
 
-        let named =
-            Rig { model: holod_calibration::rig::Model { weights: WeightsChoice::Fast, gpu: None }, ..Rig::default() };
+        let named = Rig {
+            model: holod_calibration::rig::Model { weights: WeightsChoice::Fast, ..rig.model.clone() },
+            ..Rig::default()
+        };
         for name in ["other", "third"] {
             fs::create_dir(folder.path().join(name)).unwrap();
         }

@@ -18,6 +18,7 @@ use super::clock::host_now;
 use super::desk::{Changes, Desk};
 use super::feed_watch::FeedWatch;
 use super::frame_loop::{FrameLoop, RECORDS};
+use super::held_pupil::HeldPupil;
 use super::inputs::{Followed, Inputs, Playback, TrainedPupils};
 use super::laser_watch::LaserBoxWatch;
 use super::observer::{Began, Observer};
@@ -193,7 +194,12 @@ pub(super) fn build(
     };
     let inputs = match playback {
         Some(playback) => Inputs::Recorded(playback),
-        None => Inputs::Followed(Followed { pupil: estimates, pictures, steering: Arc::clone(&steering) }),
+        None => Inputs::Followed(Followed {
+            pupil: estimates,
+            held: HeldPupil::new((rig.pupil_step().0 * 1e3) as f32),
+            pictures,
+            steering: Arc::clone(&steering),
+        }),
     };
     let frame_loop = FrameLoop {
         inputs,

@@ -135,7 +135,7 @@ impl FrameLoop {
         self.orders.scene = tag.order;
         let t_picture_in_hand = tag.t_came;
         if !is_hologram {
-            (pupil.t_sample, pupil.raw_mm, tag) = (None, None, PictureTag::default());
+            (pupil.t_sample, pupil.raw_mm, pupil.estimate, tag) = (None, None, None, PictureTag::default());
         }
         if rendered.engine_changed {
             // It happens when a device is lost, which took longer than any lock.
@@ -155,6 +155,7 @@ impl FrameLoop {
                 t_sample: pupil.t_sample,
                 pupil_raw_mm: pupil.raw_mm,
                 pupil: pupil.pupil,
+                pupil_estimate: pupil.estimate,
                 pupil_state: pupil.state,
                 t_wake,
                 t_render_begin,

@@ -7,6 +7,7 @@ use holod_model::RgbdFrame;
 use holod_pupil_input::{EstimateReader, PupilState};
 use holod_slm_output::LevelsFrame;
 
+use super::held_pupil::HeldPupil;
 use crate::control::{NewEngine, Steering};
 use crate::record::FrameOrders;
 use crate::renderer::Renderer;
@@ -41,6 +42,8 @@ pub(super) enum Inputs {
 pub(super) struct Followed {
     /// The tracker's newest estimate.
     pub(super) pupil: EstimateReader,
+    /// The pupil that the last hologram was made for.
+    pub(super) held: HeldPupil,
     pub(super) pictures: PictureSource,
     /// What a person changes.
     pub(super) steering: Arc<Steering>,
@@ -49,6 +52,8 @@ pub(super) struct Followed {
 /// The pupil that a frame is made for.
 pub(super) struct FramePupil {
     pub(super) pupil: PupilDiameter,
+    /// What the tracker's samples make it, where they are followed.
+    pub(super) estimate: Option<PupilDiameter>,
     pub(super) t_sample: Option<TimeNs>,
     pub(super) raw_mm: Option<f32>,
     pub(super) state: &'static str,
@@ -76,19 +81,26 @@ impl Inputs {
             Self::Followed(followed) => {
                 let state = followed.pupil.pupil_at(t_wake).state.name();
                 let estimate = followed.pupil.pupil_at(t_photon.min(t_wake + FARTHEST_PREDICTION));
-                match followed.steering.fixed_pupil() {
-                    Some(pupil) => FramePupil { pupil, t_sample: None, raw_mm: None, state: FIXED_PUPIL },
-                    None => FramePupil {
-                        pupil: estimate.pupil,
-                        t_sample: estimate.t_sample,
-                        raw_mm: estimate.raw_mm,
-                        state,
-                    },
+                if let Some(fixed) = followed.steering.fixed_pupil() {
+                    let pupil = followed.held.take(fixed);
+                    return FramePupil { pupil, estimate: None, t_sample: None, raw_mm: None, state: FIXED_PUPIL };
+                }
+                // No noise is in the fallback, and what it ends at is the rig's.
+                let pupil = match estimate.state {
+                    PupilState::Fallback => followed.held.take(estimate.pupil),
+                    _ => followed.held.follow(estimate.pupil),
+                };
+                FramePupil {
+                    pupil,
+                    estimate: Some(estimate.pupil),
+                    t_sample: estimate.t_sample,
+                    raw_mm: estimate.raw_mm,
+                    state,
                 }
             }
             Self::Recorded(playback) => {
                 let cue = playback.cue();
-                FramePupil { pupil: cue.pupil, t_sample: None, raw_mm: None, state: cue.pupil_state }
+                FramePupil { pupil: cue.pupil, estimate: None, t_sample: None, raw_mm: None, state: cue.pupil_state }
             }
         }
     }

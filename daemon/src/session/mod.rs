@@ -5,6 +5,7 @@ mod clock;
 mod desk;
 mod feed_watch;
 mod frame_loop;
+mod held_pupil;
 mod inputs;
 mod laser_watch;
 mod ledger;
