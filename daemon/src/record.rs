@@ -60,6 +60,8 @@ pub struct FrameRecord {
     pub orders: FrameOrders,
     /// [`levels_xxh3`] of its levels, where that is wanted.
     pub levels_xxh3: Option<u64>,
+    /// They were made for it: the buffer did not have them already.
+    pub is_computed: bool,
 }
 
 #[cfg(test)]
@@ -84,6 +86,7 @@ impl FrameRecord {
             amplitude_constant: 1.0,
             orders: FrameOrders::default(),
             levels_xxh3: None,
+            is_computed: true,
         }
     }
 }

@@ -57,7 +57,7 @@ pub(crate) fn summary_text(summary: &Summary) -> String {
     };
     format!(
         "ended by {} after {:.1} s\n\
-         frames    {} made, {} shown ({} late), {:.1} a second of the panel's {:.1}; {} colour fields shown, {} of them \
+         frames    {} made, {} of them computed, {} shown ({} late), {:.1} a second of the panel's {:.1}; {} colour fields shown, {} of them \
          repetitions{slow}\n\
          pupil     {pupils}; frames: {}\n\
          tracker   {}: link {}, {} samples, {} rejected{trouble}{feed}\n\
@@ -67,6 +67,7 @@ pub(crate) fn summary_text(summary: &Summary) -> String {
         summary.ended_by,
         summary.duration_s,
         figures.frames_made,
+        figures.frames_computed,
         figures.frames_shown,
         figures.deadline_misses,
         summary.frames_shown_hz,

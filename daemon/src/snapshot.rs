@@ -25,6 +25,9 @@ pub struct Figures {
     pub hologram: String,
     /// Frames that were made.
     pub frames_made: u64,
+    /// Of those, frames whose levels were computed: the buffers did not have them already.
+    #[serde(default)]
+    pub frames_computed: u64,
     /// Of those, frames that came on the panel.
     pub frames_shown: u64,
     /// Frames that came on the panel later than planned.

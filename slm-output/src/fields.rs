@@ -110,6 +110,8 @@ pub struct LevelsFrame {
     samples: Vec<u16>,
     /// Which encoder's surround lies around its pattern; none since anything else wrote here.
     pub(crate) surround: Option<SurroundId>,
+    /// What its maker calls its samples; nothing since anything else wrote here.
+    content: Option<u64>,
 }
 
 /// Numbers what an encoder writes around its patterns.
@@ -129,7 +131,7 @@ impl Eq for LevelsFrame {}
 impl PartialEq for LevelsFrame {
     /// Who wrote the samples makes no difference.
     fn eq(&self, other: &Self) -> bool {
-        let Self { tag, layout, samples, surround: _ } = self;
+        let Self { tag, layout, samples, surround: _, content: _ } = self;
         (tag, layout, samples) == (&other.tag, &other.layout, &other.samples)
     }
 }
@@ -150,7 +152,13 @@ pub struct FrameTag {
 impl LevelsFrame {
     /// A frame whose every sample is level 0.
     pub fn new(layout: FrameLayout) -> Self {
-        Self { tag: FrameTag::default(), layout, samples: vec![0; FIELDS * layout.resolution.pixels()], surround: None }
+        Self {
+            tag: FrameTag::default(),
+            layout,
+            samples: vec![0; FIELDS * layout.resolution.pixels()],
+            surround: None,
+            content: None,
+        }
     }
 
     /// The frame's number and times.
@@ -170,7 +178,7 @@ impl LevelsFrame {
 
     /// All samples, to be written as a whole by whoever has made them as the panel takes them.
     pub fn samples_mut(&mut self) -> &mut [u16] {
-        self.surround = None;
+        (self.surround, self.content) = (None, None);
         &mut self.samples
     }
 
@@ -202,14 +210,14 @@ impl LevelsFrame {
     /// The levels of `colour`, to be written.
     pub fn field_mut(&mut self, colour: Colour) -> FieldMut<'_> {
         let (stride, offset) = (self.layout.stride(), self.layout.offset(self.layout.position_of(colour)));
-        self.surround = None;
+        (self.surround, self.content) = (None, None);
         FieldMut { samples: &mut self.samples[offset..], stride, resolution: self.layout.resolution }
     }
 
     /// All rows of samples, to be written by the threads of the pool that this is called in.
     pub(crate) fn par_rows_mut(&mut self) -> impl IndexedParallelIterator<Item = RowMut<'_>> {
-        let Self { layout, samples, surround, .. } = self;
-        *surround = None;
+        let Self { layout, samples, surround, content, .. } = self;
+        (*surround, *content) = (None, None);
         let FrameLayout { resolution: Resolution { width, height }, field_order, .. } = *layout;
         let stride = layout.stride();
         samples.par_chunks_exact_mut((width * stride).max(1)).enumerate().map(move |(index, samples)| {
@@ -246,7 +254,18 @@ impl LevelsFrame {
         assert_eq!(self.layout, other.layout, "frames of one output have one layout");
         self.tag = other.tag;
         self.samples.copy_from_slice(&other.samples);
-        self.surround = other.surround;
+        (self.surround, self.content) = (other.surround, other.content);
+    }
+
+    /// Calls the samples by a number, until any are written. It goes where they go: whoever gets the buffer again need
+    /// not write the same once more.
+    pub fn call_content(&mut self, content: u64) {
+        self.content = Some(content);
+    }
+
+    /// What the samples were called last, where none were written since.
+    pub fn content(&self) -> Option<u64> {
+        self.content
     }
 }
 
@@ -340,6 +359,29 @@ mod tests {
             frames_per_colour: 1,
             packing: Packing::Gray,
             video_margins: VideoMargins::default(),
+        }
+    }
+
+    #[test]
+    fn what_samples_are_called_goes_with_them_and_ends_when_any_are_written() {
+        let blank = LevelsFrame::new(layout(SMALL, PanelMode::FieldSequential, Colour::ALL));
+        let writes: [fn(&mut LevelsFrame); 3] = [
+            |frame| frame.samples_mut()[0] = 0,
+            |frame| _ = frame.field_mut(Colour::Red),
+            |frame| _ = frame.par_rows_mut(),
+        ];
+        for write in writes {
+            let mut frame = blank.clone();
+            assert_eq!(frame.content(), None);
+            frame.call_content(7);
+            assert_eq!((frame.content(), frame.clone() == blank), (Some(7), true), "a name changes no levels");
+            let mut copy = blank.clone();
+            copy.copy_from(&frame);
+            assert_eq!(copy.content(), Some(7));
+            write(&mut frame);
+            assert_eq!((frame.content(), copy.content()), (None, Some(7)));
+            copy.copy_from(&frame);
+            assert_eq!(copy.content(), None);
         }
     }
 

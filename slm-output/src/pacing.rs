@@ -152,13 +152,22 @@ impl Pacer {
 
     /// A frame was handed to the panel. Unknown frames are ignored.
     pub fn submitted(&mut self, frame_id: u64, t_submit: TimeNs) {
-        let Some(slot) = self.slots[slot_index(frame_id)].as_mut().filter(|slot| slot.frame_id == frame_id) else {
-            return;
-        };
-        if slot.t_submit.is_none() {
-            slot.t_submit = Some(t_submit);
-            self.frame_times.push(TimeNs((t_submit.0 - slot.t_wake.0).max(0)), t_submit);
+        if let Some(t_wake) = self.note_submission(frame_id, t_submit) {
+            self.frame_times.push(TimeNs((t_submit.0 - t_wake.0).max(0)), t_submit);
         }
+    }
+
+    /// The same of a frame for which there was nothing to be done: it says nothing of the time that frames take.
+    pub fn submitted_at_once(&mut self, frame_id: u64, t_submit: TimeNs) {
+        self.note_submission(frame_id, t_submit);
+    }
+
+    /// When it was to begin, at the first submission of a known frame.
+    fn note_submission(&mut self, frame_id: u64, t_submit: TimeNs) -> Option<TimeNs> {
+        let slot = self.slots[slot_index(frame_id)].as_mut().filter(|slot| slot.frame_id == frame_id)?;
+        let is_first = slot.t_submit.is_none();
+        slot.t_submit.get_or_insert(t_submit);
+        is_first.then_some(slot.t_wake)
     }
 
     /// The panel says that `frame_id` was first shown at `t_present`. Reports may come late, early, twice, in any
@@ -589,6 +598,28 @@ mod tests {
         assert_ne!(after, before, "a report that can be is taken in");
         pacer.report(id, good + TimeNs(2 * MS), TimestampSource::Hardware);
         assert_eq!(next(&pacer), after, "reported before");
+    }
+
+    #[test]
+    fn frames_that_took_no_work_change_no_budget_and_come_no_oftener() {
+        let mut pacer = Pacer::new(PacingConfig { first_frame_time: TimeNs(40 * MS), ..config() }, TimeNs(0));
+        let budget = pacer.budget();
+        let mut now = TimeNs(MS);
+        let mut planned = Vec::new();
+        for _ in 0..100 {
+            let plan = pacer.predict(now);
+            now = plan.t_wake + TimeNs(MS / 10);
+            pacer.submitted_at_once(plan.frame_id, now);
+            planned.push(plan.t_desired_present);
+        }
+        assert_eq!(pacer.budget(), budget);
+        // 41 ms are three refreshes.
+        assert!(planned.windows(2).all(|pair| pair[1] - pair[0] == TimeNs(3 * REFRESH.0)), "{planned:?}");
+        pacer.submitted(pacer.last_frame_id, now + TimeNs(200 * MS));
+        assert_eq!(pacer.budget(), budget, "it was submitted already");
+        let plan = pacer.predict(now);
+        pacer.submitted(plan.frame_id, plan.t_wake + TimeNs(3 * MS));
+        assert_eq!(pacer.budget(), TimeNs(4 * MS), "a frame that was computed tells its time");
     }
 
     #[test]

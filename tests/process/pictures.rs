@@ -11,7 +11,7 @@ use holod_pupil_input::SampleEye;
 use holod_pupil_input::wire::line::{LineSample, encode_line};
 use holod_slm_output::PanelEncoder;
 use holod_tests::daemon::run;
-use holod_tests::small_rig;
+use holod_tests::{frames, small_rig};
 
 use crate::HOLOD;
 
@@ -39,6 +39,57 @@ fn staircase_log(steps_mm: &[f32]) -> String {
         }
     }
     text
+}
+
+#[test]
+fn what_the_buffers_have_already_is_not_computed_again() {
+    let folder = holod_tests::new_folder();
+    let rig = format!("{}[model]\nnetwork = \"fast\"\n", small_rig(64, 64, "driver = \"simulated\""));
+    fs::write(folder.path().join("rig.toml"), rig).unwrap();
+    let record = |name: &str, more: &[&str]| {
+        let args = ["--config", "rig.toml", "--resolution", "64x64", "--frames", "60", "--json", "--record", name];
+        let ended = run(HOLOD, &[&args[..], more].concat(), folder.path());
+        assert!(ended.status.success(), "{}", ended.stderr);
+        let summary: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+        let rows = frames::read(&folder.path().join(name).join("frames.csv")).unwrap();
+        let mut levels: Vec<_> = rows.iter().map(|row| row.levels_xxh3.clone()).collect();
+        levels.sort();
+        levels.dedup();
+        assert!(!levels.contains(&String::new()));
+        assert_eq!((&summary["frames_made"], &summary["lasers"]["unsafe_findings"]), (&60.into(), &0.into()));
+        (summary, levels)
+    };
+    let (still, levels) = record("still", &["--pupil", "3"]);
+    assert_eq!(levels.len(), 1);
+    // Three buffers go round, and one that the panel has.
+    assert!((1..=4).contains(&still["frames_computed"].as_u64().unwrap()), "{still:#}");
+    assert_eq!(still["frame_time"]["values"], still["frames_computed"]);
+    assert_eq!(still["frames_by_pupil_state"]["fixed"], 60);
+    assert!(still["frames_shown"].as_u64().unwrap() > 30, "{still:#}");
+
+    // A report of it is shown again with the same levels.
+    let packed = run(HOLOD, &["report", "still", "--out", "report.tar.gz"], folder.path());
+    assert!(packed.status.success(), "{}", packed.stderr);
+    let again = run(HOLOD, &["--tracker", "replay:report.tar.gz", "--json"], folder.path());
+    assert!(again.status.success(), "{}", again.stderr);
+    let again: serde_json::Value = serde_json::from_str(&again.stdout).unwrap();
+    assert_eq!((&again["report"]["frames_different"], &again["report"]["fields_different"]), (&0.into(), &0.into()));
+    assert_eq!(again["report"]["frames_same"], again["report"]["frames_recorded"]);
+
+    // Of a sequence and of a pupil that moves there is something new each time.
+    fs::create_dir(folder.path().join("sequence")).unwrap();
+    for frame in 0..4_u8 {
+        let colour = image::RgbImage::from_pixel(64, 64, image::Rgb([60 * frame; 3]));
+        colour.save(folder.path().join(format!("sequence/colour{frame}.png"))).unwrap();
+    }
+    let depth = image::ImageBuffer::from_fn(64, 64, |x, _| image::Luma([500_u16 + 10 * x as u16]));
+    depth.save(folder.path().join("sequence/depth.png")).unwrap();
+    let scene = "colour = \"colour{}.png\"\ndepth = \"depth.png\"\ndepth_encoding = \"millimetres\"\nfps = 60.0\n\
+                 count = 4\n";
+    fs::write(folder.path().join("sequence/scene.toml"), scene).unwrap();
+    let (sequence, levels) = record("moving", &["--pupil", "3", "--scene", "sequence"]);
+    assert_eq!(levels.len(), 4);
+    assert!(sequence["frames_computed"].as_u64().unwrap() > 40, "{sequence:#}");
 }
 
 /// Brightness of the two cards' halves, 8 bits.

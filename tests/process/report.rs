@@ -419,7 +419,7 @@ fn a_report_names_no_file_outside_of_it() {
     whole(&|report| {
         let order = format!("{{\"t_ns\":1,\"request\":{{\"do\":\"scene\",\"scene\":\"{}\"}}}}\n", outside.display());
         fs::write(report.join("orders.jsonl"), order).unwrap();
-        rewrite(report.join("frames.csv"), ",0,0,0,,,\n", ",0,0,1,,,\n");
+        rewrite(report.join("frames.csv"), ",0,0,0,,,,", ",0,0,1,,,,");
     });
     refused("order 1: it brought no pattern");
 }

@@ -113,13 +113,14 @@ fn steps(rows: &[FieldRow]) -> Steps {
     for row in rows {
         let Some(estimate_mm) = row.pupil_estimate_mm else { continue };
         let is_new = before.is_none_or(|before| before.pupil_mm != row.pupil_mm);
-        let is_other_frame = before.is_some_and(|before| before.frame + 1 == row.frame);
+        // Of a frame between them that was never shown nothing is known here.
+        let is_next = before.is_some_and(|before| before.frame + 1 == row.frame);
         let moved_mm = before.map(|before| (estimate_mm - before.pupil_mm).abs());
         steps.count += usize::from(is_new && before.is_some());
         let is_held = (estimate_mm - row.pupil_mm).abs() <= PUPIL_STEP_MM;
-        let is_exact = !is_new || estimate_mm == row.pupil_mm;
+        let is_exact = !is_new || !is_next || estimate_mm == row.pupil_mm;
         // In the fallback, which has no noise, each is made for its own.
-        let is_due = !is_new || !is_other_frame || row.pupil_state == "fallback" || moved_mm > Some(PUPIL_STEP_MM);
+        let is_due = !is_new || !is_next || row.pupil_state == "fallback" || moved_mm > Some(PUPIL_STEP_MM);
         if !(is_held && is_exact && is_due) {
             steps.faults.push(format!("frame {}: {} mm for an estimate of {estimate_mm}", row.frame, row.pupil_mm));
         }

@@ -5,8 +5,8 @@ use std::fmt::Write;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use holod_calibration::rig::{LaserDriver, Lasers, Rig};
-use holod_calibration::{PupilDiameter, Resolution, Sorted};
+use holod_calibration::rig::{LaserDriver, Lasers, Model, Rig};
+use holod_calibration::{Metres, PupilDiameter, Resolution, Sorted};
 use holod_model::engine::{StageTiming, fma_peak, stream_bandwidth};
 use holod_model::{RgbdFrame, Weights};
 use holod_pupil_input::{Scenario, TrackerSpec};
@@ -283,8 +283,10 @@ fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: scene::Fram
     struct Nobody;
     impl Observer for Nobody {}
 
+    // Each frame is to be computed.
+    let model = Model { pupil_step: Some(Metres(0.0)), ..rig.model };
     let plan = SessionPlan {
-        rig: Rig { lasers: Lasers { driver: LaserDriver::Simulated, ..rig.lasers }, ..rig },
+        rig: Rig { lasers: Lasers { driver: LaserDriver::Simulated, ..rig.lasers }, model, ..rig },
         rig_again: None,
         hangups: None,
         weights,

@@ -282,7 +282,9 @@ impl Log {
         let mut render = Vec::new();
         for field in &self.first_fields {
             let Some(frame) = self.frames.iter().find(|frame| frame.frame == field.frame_id) else { continue };
-            render.push((since(field.t_present), ms(frame.t_submit - frame.t_wake)));
+            if frame.is_computed {
+                render.push((since(field.t_present), ms(frame.t_submit - frame.t_wake)));
+            }
         }
         let [photon, missed] = self.latencies(since);
         LatencyPlot { render_ms: &render, sample_to_photon_ms: &photon, missed: &missed }

@@ -97,7 +97,9 @@ impl Observer for Page {
 
     fn frame(&mut self, record: &FrameRecord) -> Result<(), Failure> {
         self.eye.note(record);
-        self.live.latencies.frame(record.t_submit - record.t_wake);
+        if record.is_computed {
+            self.live.latencies.frame(record.t_submit - record.t_wake);
+        }
         let milliseconds = |from: TimeNs, to: TimeNs| ((to - from).0 / 1000) as f64 / 1e3;
         self.gathered.frames.push(live::MadeFrame(
             record.frame,

@@ -224,6 +224,7 @@ mod tests {
             amplitude_constant: 1.0,
             orders: FrameOrders { scene: 2, weights: 0, pattern: 1 },
             levels_xxh3: Some(0xab),
+            is_computed: true,
         }
     }
 

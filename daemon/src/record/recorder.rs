@@ -457,6 +457,7 @@ mod tests {
             amplitude_constant: 1.0,
             orders: FrameOrders::default(),
             levels_xxh3: None,
+            is_computed: true,
         }
     }
 

@@ -218,6 +218,8 @@ pub(super) fn build(
         hash_levels: plan.hash_levels,
         submitted: 0,
         shown: 0,
+        made: None,
+        engines_failed: 0,
         limit: plan.frame_limit,
         engine: Arc::clone(&engine),
         stop: Arc::clone(&stop),

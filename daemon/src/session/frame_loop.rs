@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use holod_calibration::{PerColour, TimeNs};
+use holod_calibration::{PerColour, PupilDiameter, TimeNs};
 use holod_model::engine::EngineError;
 use holod_slm_output::{FramePlan, FramePort, LevelsFrame, Pacer};
 
@@ -54,12 +54,35 @@ pub(super) struct FrameLoop {
     /// The newest frame that the panel was handed, and the newest that it has shown.
     pub submitted: u64,
     pub shown: u64,
+    /// What was made last.
+    pub made: Option<Made>,
+    /// Engines that took another's place because that failed.
+    pub engines_failed: u32,
     /// Frames to make; without end where absent.
     pub limit: Option<u64>,
     /// How holograms are computed, for the status.
     pub engine: Arc<Mutex<String>>,
     /// Set by the control thread.
     pub stop: Arc<AtomicBool>,
+}
+
+/// What levels are made of. Where all of it is the same, they are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Content {
+    /// The orders and the failures stand for the engine.
+    Hologram { picture: PictureTag, pupil: PupilDiameter, weights_order: u32, engines_failed: u32 },
+    /// The order stands for it.
+    Pattern(u32),
+}
+
+/// Levels that were made.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Made {
+    content: Content,
+    /// What the buffers call them that have them.
+    number: u64,
+    rendered: Rendered,
+    levels_xxh3: Option<u64>,
 }
 
 /// What takes another's place in the loop, and what has made way for it.
@@ -124,26 +147,47 @@ impl FrameLoop {
         let t_render_begin = host_now();
         let FrameContent { picture, mut tag, pattern } = self.inputs.content(plan.t_predicted_photon);
         let pattern = pattern.or(self.pattern.as_deref());
-        let rendered = match pattern {
-            None => self.renderer.render(picture, pupil.pupil, self.port.acquire())?,
-            Some(pattern) => {
-                self.port.acquire().copy_from(pattern);
+        let is_hologram = pattern.is_none();
+        self.orders.scene = tag.order;
+        let FrameOrders { weights: weights_order, pattern: pattern_order, .. } = self.orders;
+        let (picture_tag, pupil_mm) = (tag, pupil.pupil);
+        let content = |engines_failed| match is_hologram {
+            true => Content::Hologram { picture: picture_tag, pupil: pupil_mm, weights_order, engines_failed },
+            false => Content::Pattern(pattern_order),
+        };
+        let again = self.made.filter(|made| made.content == content(self.engines_failed));
+        let buffer = self.port.acquire();
+        // Each of the buffers that go round has to be filled once.
+        let there = again.filter(|made| buffer.content() == Some(made.number));
+        let rendered = match (there, pattern) {
+            (Some(made), _) => made.rendered,
+            (None, None) => self.renderer.render(picture, pupil.pupil, buffer)?,
+            (None, Some(pattern)) => {
+                buffer.copy_from(pattern);
                 Rendered::default()
             }
         };
-        let is_hologram = pattern.is_none();
-        self.orders.scene = tag.order;
         let t_picture_in_hand = tag.t_came;
         if !is_hologram {
             (pupil.t_sample, pupil.raw_mm, pupil.estimate, tag) = (None, None, None, PictureTag::default());
         }
-        if rendered.engine_changed {
+        let engine_changed = there.is_none() && rendered.engine_changed;
+        if engine_changed {
+            self.engines_failed += 1;
             // It happens when a device is lost, which took longer than any lock.
             self.renderer.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
         }
         let t_render_end = host_now();
 
-        let levels_xxh3 = self.hash_levels.then(|| levels_xxh3(self.port.acquire()));
+        let made = there.unwrap_or_else(|| {
+            let again = again.filter(|_| !engine_changed);
+            let number = again.map_or_else(|| self.made.map_or(1, |made| made.number + 1), |made| made.number);
+            let buffer = self.port.acquire();
+            buffer.call_content(number);
+            let levels_xxh3 = self.hash_levels.then(|| levels_xxh3(buffer));
+            Made { content: content(self.engines_failed), number, rendered, levels_xxh3 }
+        });
+        self.made = Some(made);
         let keep = if self.keep_levels && is_hologram && pupil.is_meant() { keep_slot(pupil.pupil) } else { None };
         if matches!(self.inputs, Inputs::Recorded(_)) {
             self.wait_for_the_panel();
@@ -166,7 +210,8 @@ impl FrameLoop {
                 keep,
                 amplitude_constant: self.renderer.amplitude_constant(),
                 orders: self.orders,
-                levels_xxh3,
+                levels_xxh3: made.levels_xxh3,
+                is_computed: there.is_none(),
             },
             t_picture_in_hand,
             beyond_trained: !self.trained.contain(pupil.pupil),
@@ -178,7 +223,10 @@ impl FrameLoop {
             self.records_lost.fetch_add(1, Ordering::Relaxed);
         }
         self.port.submit(&plan, keep, t_submit);
-        self.pacer.submitted(plan.frame_id, t_submit);
+        match there {
+            None => self.pacer.submitted(plan.frame_id, t_submit),
+            Some(_) => self.pacer.submitted_at_once(plan.frame_id, t_submit),
+        }
         self.submitted = plan.frame_id;
         self.hear_the_panel();
         Ok(())

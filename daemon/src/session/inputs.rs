@@ -79,14 +79,14 @@ impl Inputs {
     pub(super) fn pupil(&mut self, t_wake: TimeNs, t_photon: TimeNs) -> FramePupil {
         match self {
             Self::Followed(followed) => {
-                let state = followed.pupil.pupil_at(t_wake).state.name();
+                let state = followed.pupil.pupil_at(t_wake).state;
                 let estimate = followed.pupil.pupil_at(t_photon.min(t_wake + FARTHEST_PREDICTION));
                 if let Some(fixed) = followed.steering.fixed_pupil() {
                     let pupil = followed.held.take(fixed);
                     return FramePupil { pupil, estimate: None, t_sample: None, raw_mm: None, state: FIXED_PUPIL };
                 }
                 // No noise is in the fallback, and what it ends at is the rig's.
-                let pupil = match estimate.state {
+                let pupil = match state {
                     PupilState::Fallback => followed.held.take(estimate.pupil),
                     _ => followed.held.follow(estimate.pupil),
                 };
@@ -95,7 +95,7 @@ impl Inputs {
                     estimate: Some(estimate.pupil),
                     t_sample: estimate.t_sample,
                     raw_mm: estimate.raw_mm,
-                    state,
+                    state: state.name(),
                 }
             }
             Self::Recorded(playback) => {

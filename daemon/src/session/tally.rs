@@ -23,6 +23,7 @@ pub(super) struct Tally {
     kept: [Option<FrameRecord>; KEEP_SLOTS],
     pub(super) lasers: LaserLedger,
     pub(super) frames_made: u64,
+    pub(super) frames_computed: u64,
     pub(super) frames_shown: u64,
     pub(super) fields_shown: u64,
     pub(super) fields_repeated: u64,
@@ -52,7 +53,10 @@ impl Tally {
         self.newest_made = frame.frame;
         self.newest_state = frame.pupil_state;
         *self.by_state.entry(frame.pupil_state).or_default() += 1;
-        self.frame_time.push((frame.t_submit - frame.t_wake).seconds() as f32 * 1e3);
+        if frame.is_computed {
+            self.frames_computed += 1;
+            self.frame_time.push((frame.t_submit - frame.t_wake).seconds() as f32 * 1e3);
+        }
         let pupil_mm = frame.pupil.mm();
         self.beyond_trained += u64::from(record.beyond_trained);
         let [narrowest, widest] = self.pupil_range_mm.unwrap_or([pupil_mm; 2]);
@@ -101,7 +105,8 @@ impl Tally {
         let light = FirstLight {
             frame: frame.frame,
             t,
-            sample_to_photon: frame.t_sample.map(|t_sample| t - t_sample),
+            // What is there already comes sooner than what follows a sample.
+            sample_to_photon: frame.t_sample.filter(|_| frame.is_computed).map(|t_sample| t - t_sample),
             picture_to_photon: new_picture.filter(|_| frame.picture.is_live()).map(|t_taken| t - t_taken),
         };
         let milliseconds = |time: TimeNs| time.seconds() as f32 * 1e3;

@@ -470,6 +470,7 @@ impl Watch<'_> {
             engine: names.engine(),
             hologram: names.hologram.to_string(),
             frames_made: tally.frames_made,
+            frames_computed: tally.frames_computed,
             frames_shown: tally.frames_shown,
             deadline_misses: tally.deadline_misses,
             panel_frames_hz: speed::panel_frames_hz(&self.rig.panel),
