@@ -38,9 +38,9 @@ pub struct Figures {
     pub panel_refresh_hz: f64,
     /// What would bring the frames shown nearer to those that the panel could show, where that is needed.
     pub speed_advice: Option<String>,
-    /// From waking to the submitted levels.
+    /// From waking to the submitted levels, of frames that were computed.
     pub frame_time: Option<Spread>,
-    /// From the newest believed tracker sample behind a frame to the middle of its first light.
+    /// From the newest believed tracker sample behind a frame that was computed to the middle of its first light.
     pub sample_to_photon: Option<Spread>,
     /// From when a feed's client took a picture to the middle of its first light.
     pub picture_to_photon: Option<Spread>,

@@ -132,6 +132,7 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
     told.gauge("panel_refresh", "What the panel reports", hertz(), figures.panel_refresh_hz)?;
     told.gauge("panel_frame", "Frames of all colours that the panel could show", hertz(), figures.panel_frames_hz)?;
     told.counter("frames_made", "Frames that were made", figures.frames_made)?;
+    told.counter("frames_computed", "Of those, frames whose levels were computed", figures.frames_computed)?;
     told.counter("frames_shown", "Frames that came on the panel", figures.frames_shown)?;
     told.counter("deadline_misses", "Frames that came later than planned", figures.deadline_misses)?;
     of_tracker(told, &figures.tracker_counts)?;
