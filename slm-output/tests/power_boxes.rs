@@ -28,6 +28,12 @@ struct Device {
     values: HashMap<(u16, u8), u32>,
     lit: bool,
     power_w: String,
+    /// In which way a text laser says how bright it is.
+    mode: &'static str,
+    /// It is lit by a change of its mode.
+    lit_by_mode: bool,
+    /// It answers to a change of its mode, and keeps it.
+    keeps_mode: bool,
     interlock: &'static str,
     mute: bool,
     /// How long it takes to answer.
@@ -145,7 +151,7 @@ fn ready_beam(device_type: u32) -> Bench {
     bench
 }
 
-/// A Cobolt laser, which begins lit.
+/// A Cobolt laser, which begins lit, at constant current.
 fn cobolt() -> Bench {
     let bench = Bench::plug_in(b'\r', |device, line| {
         let answer = match line {
@@ -161,6 +167,11 @@ fn cobolt() -> Bench {
                 "OK".to_owned()
             }
             "@cobas 0" => "OK".to_owned(),
+            "gam?" => device.mode.to_owned(),
+            "cp" => {
+                change_mode(device, "1");
+                "OK".to_owned()
+            }
             _ => match line.strip_prefix("p ") {
                 Some(watts) => {
                     watts.clone_into(&mut device.power_w);
@@ -171,14 +182,26 @@ fn cobolt() -> Bench {
         };
         format!("{answer}\r\n").into_bytes()
     });
-    bench.with(|device| device.lit = true);
+    bench.with(|device| (device.lit, device.mode) = (true, "0"));
     bench
 }
 
-/// A Coherent OBIS laser with its handshake, which acknowledges questions, too.
+fn change_mode(device: &mut Device, mode: &'static str) {
+    if !device.keeps_mode {
+        device.mode = mode;
+    }
+    device.lit |= device.lit_by_mode;
+}
+
+/// A Coherent OBIS laser with its handshake, which acknowledges questions, too. It begins under a digital input.
 fn obis() -> Bench {
-    Bench::plug_in(b'\n', |device, line| {
+    let bench = Bench::plug_in(b'\n', |device, line| {
         let answer = match line {
+            "SOUR:AM:SOUR?" => format!("{}\r\nOK", device.mode),
+            "SOUR:AM:INT CWP" => {
+                change_mode(device, "CWP");
+                "OK".to_owned()
+            }
             "*IDN?" => "Coherent, Inc-OBIS 520nm 40mW C-V2.3\r\nOK".to_owned(),
             "SOUR:AM:STATE ON" | "SOUR:AM:STATE OFF" => {
                 device.lit = line.ends_with("ON");
@@ -193,7 +216,9 @@ fn obis() -> Bench {
             },
         };
         format!("{answer}\r\n").into_bytes()
-    })
+    });
+    bench.with(|device| device.mode = "DIGITAL");
+    bench
 }
 
 fn text_lasers(profile: &str, paths: [Option<&Bench>; 3]) -> LaserDriver {
@@ -336,6 +361,10 @@ fn lasers_that_cannot_gate_fields_light_several_colours_only_where_the_panel_gat
     drop(laser);
     let gated = Lasers { gated_by_panel: true, ..lasers(driver.clone()) };
     let mut laser = open_laser(&gated, host_now).unwrap();
+    // Of a gray frame no panel knows the colour.
+    let sequential = program(PanelMode::FieldSequential);
+    assert!(matches!(takes(&gated, &sequential, None), Err(LaserError::CannotGate)));
+    assert!(matches!(laser.program(&sequential, host_now()), Err(LaserError::CannotGate)));
     takes(&gated, &program(PanelMode::ChannelPacked), None).unwrap();
     laser.program(&program(PanelMode::ChannelPacked), host_now()).unwrap();
     laser.arm(host_now()).unwrap();
@@ -427,7 +456,7 @@ fn darkness_does_not_wait_for_all_the_questions_whether_lasers_are_well() {
         laser.dark(DarkReason::Asked, host_now()).unwrap();
         let questions = benches.iter().zip(heard).flat_map(|(bench, heard)| bench.heard().split_off(heard));
         let questions: Vec<_> = questions.filter(|line| line.ends_with('?')).collect();
-        // The one that was being asked, and on a busy machine one before the order came; of six.
+        // The one that was being asked, and on a busy machine one before the order came; of nine.
         assert!(questions.len() <= 2, "{questions:?} before the lasers went out");
     }
 }
@@ -462,11 +491,88 @@ fn lasers_are_put_out_at_the_start_whatever_is_wrong_with_one_of_them() {
         if let LaserError::Complaint { .. } = error {
             let text = error.to_string();
             assert!(
-                text.ends_with("answered `1` to `ilk?`; expected `0`: check its interlock and its faults"),
+                text.ends_with("answered `1` to `ilk?`; expected `0`: check its interlock, faults and operating mode"),
                 "{text}"
             );
         }
     }
+}
+
+/// In every other one the power that holod sets is without effect, and a stored current or an outer signal says how
+/// bright it is.
+#[test]
+fn text_lasers_are_lit_in_the_mode_in_which_their_power_is_in_force_and_in_no_other() {
+    for (name, bench, right, wrong, ask) in
+        [("cobolt", cobolt(), "1", "2", "gam?"), ("coherent-obis", obis(), "CWP", "ANALOG", "SOUR:AM:SOUR?")]
+    {
+        let driver = text_lasers(name, [None, Some(&bench), None]);
+        bench.with(|device| (device.keeps_mode, device.lit_by_mode) = (true, true));
+        let error = open_laser(&lasers(driver.clone()), host_now).err().unwrap().to_string();
+        assert!(error.contains(&format!("to `{ask}`; expected `{right}`")) && error.contains("mode"), "{error}");
+        assert!(!bench.with(|device| device.lit), "{name}: whatever its mode does");
+
+        bench.with(|device| device.keeps_mode = false);
+        let mut laser = open_laser(&lasers(driver), host_now).unwrap();
+        assert!(!bench.with(|device| device.lit), "{name}: whatever its mode does");
+        assert_eq!(bench.with(|device| device.mode), right, "{name}");
+        laser.program(&program(GREEN), host_now()).unwrap();
+        laser.arm(host_now()).unwrap();
+        alive_until(laser.as_mut(), || bench.with(|device| device.lit));
+        // Its knob is turned, or a second program has its port.
+        bench.with(|device| (device.mode, device.keeps_mode) = (wrong, true));
+        let watch = laser.watch().unwrap();
+        eventually("the mode", || {
+            let _lost = laser.heartbeat(host_now());
+            let _lost = laser.poll(host_now(), &mut |_| ());
+            watch.trouble().is_some_and(|trouble| trouble.contains(ask))
+        });
+        eventually("darkness", || !bench.with(|device| device.lit));
+    }
+}
+
+#[test]
+fn a_ready_beam_that_says_error_is_dark_and_not_lit_again_until_it_is_well() {
+    let bench = ready_beam(1171);
+    let full_power_uw = PerColour([40_000; 3]);
+    let driver = lasers(LaserDriver::ReadyBeam { path: bench.path.clone(), full_power_uw });
+    let lit = || bench.with(|device| (1..=3).any(|instance| device.values[&(7006, instance)] == 1));
+    let status = |status| bench.with(|device| device.values.extend([((104, 1), status)]));
+    let mut laser = open_laser(&driver, host_now).unwrap();
+    laser.program(&program(GREEN), host_now()).unwrap();
+    laser.arm(host_now()).unwrap();
+    alive_until(laser.as_mut(), lit);
+    status(3);
+    eventually("darkness", || {
+        let _lost = laser.poll(host_now(), &mut |_| ());
+        let _lost = laser.heartbeat(host_now());
+        !lit()
+    });
+    let heard = bench.heard().len();
+    // As a run does, which arms it again as soon as it may.
+    let t_end = host_now() + TimeNs(3000 * MS);
+    while host_now() < t_end {
+        let _lost = laser.poll(host_now(), &mut |_| ());
+        let _lost = laser.arm(host_now());
+        let _lost = laser.heartbeat(host_now());
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let lights = |frame: &String| frame.contains("VS1B5E") && frame[15..].starts_with("00000001");
+    let again = bench.heard().split_off(heard).into_iter().filter(lights).count();
+    assert_eq!(again, 0, "lit though it says error");
+    status(2);
+    eventually("light", || {
+        let _lost = laser.poll(host_now(), &mut |_| ());
+        let _lost = laser.arm(host_now());
+        let _lost = laser.heartbeat(host_now());
+        lit()
+    });
+    drop(laser);
+    // One that is found like this does not stay lit.
+    status(3);
+    bench.with(|device| device.values.insert((7006, 3), 1));
+    let error = open_laser(&driver, host_now).err().unwrap();
+    assert!(matches!(error, LaserError::Complaint { .. }), "{error}");
+    assert!(!lit());
 }
 
 #[test]

@@ -506,6 +506,7 @@ fn slow_cobolt(link: &Path) -> Arc<Mutex<Vec<String>>> {
             let answer = match command.as_str() {
                 "sn?" => "12034",
                 "ilk?" | "f?" => "0",
+                "gam?" => "1",
                 _ => "OK",
             };
             its_words.lock().unwrap().push(command);

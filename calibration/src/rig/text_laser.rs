@@ -46,9 +46,10 @@ pub struct TextLaserProfile {
     pub answer_timeout_ms: u32,
     /// What tells it from another device: harmless reads, asked before anything else is said.
     pub identify: Vec<Question>,
-    /// What it must say while it is used: its interlock, its faults.
+    /// What it must say while it is used: its interlock, its faults, the mode in which [`Self::power`] is in force.
     pub healthy: Vec<Question>,
-    /// Commands that bring it to where power alone lights nothing.
+    /// Commands, sent while it is dark, that bring it to where power alone lights nothing and [`Self::power`] is in
+    /// force.
     pub prepare: Vec<String>,
     /// The command that sets its power: with `{power_w}` or `{power_mw}` in it.
     pub power: String,

@@ -238,7 +238,7 @@ pub enum LaserError {
     NotAccepted,
     /// The box cannot light one field and not the next.
     #[error(
-        "these lasers cannot be switched for single fields: show one colour only (panel.mode = \"monochrome\"), or write lasers.gated_by_panel = true where the panel's own hardware gates them"
+        "these lasers cannot be switched for single fields: show one colour only (panel.mode = \"monochrome\"), or write lasers.gated_by_panel = true where the panel's own hardware gates them, which it can in mode \"channel-packed\""
     )]
     CannotGate,
     /// The bench has no laser of a colour that is to be shown.

@@ -18,7 +18,7 @@ use serialport::TTYPort;
 
 use super::line_link::{Sharing, open_port};
 use super::program::power_limit_uw;
-use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow};
+use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow, Trigger};
 
 /// How often a device is asked whether it is still there and healthy.
 const PROBE_EVERY: TimeNs = TimeNs(500_000_000);
@@ -43,8 +43,20 @@ pub(super) trait PowerDevice: Send + 'static {
     /// Sets the power of each laser for when it is lit, microwatts at the panel. Lights nothing.
     fn set_power(&mut self, power_uw: PerColour<u32>) -> Result<(), LaserError>;
 
-    /// Lights the lasers of `lit` and puts out all others, and has made sure of both when it returns.
-    fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError>;
+    /// Lights the laser of `colour` or puts it out, and has made sure of it when it returns; one that is not there is
+    /// out.
+    fn switch(&mut self, colour: Colour, on: bool) -> Result<(), LaserError>;
+
+    /// Lights the lasers of `lit` and puts out all others, and has made sure of both when it returns: out before on, and
+    /// all that can be put out is, even where one of them does not obey.
+    fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
+        let mut put_out = Ok(());
+        for colour in Colour::ALL.into_iter().filter(|&colour| !lit[colour]) {
+            put_out = put_out.and(self.switch(colour, false));
+        }
+        put_out?;
+        Colour::ALL.into_iter().filter(|&colour| lit[colour]).try_for_each(|colour| self.switch(colour, true))
+    }
 
     /// Asks one of the questions whether it is there and healthy, after `asked` of them; whether it was the last one.
     fn probe(&mut self, asked: usize) -> Result<bool, LaserError>;
@@ -237,7 +249,8 @@ pub(super) fn put_out_beside<D>(
     }
 }
 
-/// The lasers that are lit in `program`, of those that a bench `has`: one without power stays off.
+/// The lasers that are lit in `program`, of those that a bench `has`: one without power stays off. Of several colours a
+/// panel gates the lasers (`gated_by_panel`) only where its own sequencer shows them, in channel-packed mode.
 ///
 /// # Errors
 /// [`LaserError::CannotGate`], [`LaserError::NoLaser`].
@@ -247,8 +260,9 @@ pub(super) fn colours_lit(
     has: PerColour<bool>,
 ) -> Result<PerColour<bool>, LaserError> {
     let is_in = |colour: Colour| program.sequence.contains(&colour);
+    let panel_gates = gated_by_panel && program.trigger == Trigger::PanelSync;
     // One that is lit among fields of others would be on in theirs, too.
-    if Colour::ALL.into_iter().filter(|&colour| is_in(colour)).count() > 1 && !gated_by_panel {
+    if Colour::ALL.into_iter().filter(|&colour| is_in(colour)).count() > 1 && !panel_gates {
         return Err(LaserError::CannotGate);
     }
     let lit = PerColour(Colour::ALL.map(|colour| is_in(colour) && program.power_uw[colour] > 0));
@@ -416,6 +430,8 @@ impl<D: PowerDevice> Worker<D> {
                 self.set_lit(NONE_LIT)?;
                 self.device.set_power(power_uw)
             }
+            // Until it says that it is well again.
+            Order::Lit(lit) if lit != NONE_LIT && self.failed => Err(LaserError::Lost),
             Order::Lit(lit) => self.set_lit(lit),
         }
     }
@@ -503,8 +519,8 @@ mod tests {
 
     use super::*;
 
-    /// A device that remembers what it was told, and ends its thread when it is put out.
-    struct Told(Arc<Mutex<Vec<PerColour<bool>>>>, Arc<AtomicBool>);
+    /// A device that remembers whether it was lit or put out, and ends its thread when it is put out.
+    struct Told(Arc<Mutex<Vec<bool>>>, Arc<AtomicBool>);
 
     impl PowerDevice for Told {
         fn has(&self, _colour: Colour) -> bool {
@@ -515,9 +531,9 @@ mod tests {
             Ok(())
         }
 
-        fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
-            self.0.lock().unwrap().push(lit);
-            self.1.store(lit == NONE_LIT, Ordering::Release);
+        fn switch(&mut self, _colour: Colour, on: bool) -> Result<(), LaserError> {
+            self.0.lock().unwrap().push(on);
+            self.1.store(!on, Ordering::Release);
             Ok(())
         }
 
@@ -530,13 +546,12 @@ mod tests {
         }
     }
 
-    #[test]
-    fn an_order_to_light_that_one_for_darkness_follows_is_left_out() {
+    /// What a device is told of the orders `lit`, numbered from 1 on, and what is reported of them.
+    fn obeyed(lit: &[PerColour<bool>], failed: bool) -> (Vec<bool>, Vec<Report>) {
         let (mut orders, order_consumer) = RingBuffer::new(RING);
         let (report_producer, mut reports) = RingBuffer::new(RING);
         let (told, stop) = (Arc::default(), Arc::new(AtomicBool::new(false)));
-        let all = PerColour([true; 3]);
-        for (number, lit) in [(1, all), (2, NONE_LIT), (3, all), (4, NONE_LIT)] {
+        for (number, &lit) in (1..).zip(lit) {
             orders.push((number, Order::Lit(lit))).unwrap();
         }
         let worker = Worker {
@@ -549,13 +564,27 @@ mod tests {
             maybe_lit: false,
             t_probe: TimeNs(0),
             asked: 0,
-            failed: false,
+            failed,
             clock: || TimeNs(1),
         };
         worker.run();
-        let told = told.lock().unwrap();
-        assert!(!told.is_empty() && told.iter().all(|lit| *lit == NONE_LIT), "{told:?}");
-        let done: Vec<_> = std::iter::from_fn(|| reports.pop().ok()).collect();
+        let told = told.lock().unwrap().clone();
+        (told, std::iter::from_fn(|| reports.pop().ok()).collect())
+    }
+
+    const ALL_LIT: PerColour<bool> = PerColour([true; 3]);
+
+    #[test]
+    fn an_order_to_light_that_one_for_darkness_follows_is_left_out() {
+        let (told, done) = obeyed(&[ALL_LIT, NONE_LIT, ALL_LIT, NONE_LIT], false);
+        assert!(!told.is_empty() && told.iter().all(|on| !on), "{told:?}");
         assert!(matches!(done[..], [Report::Done(2), Report::Done(4)]), "{done:?}");
+    }
+
+    #[test]
+    fn a_device_that_failed_is_not_lit_until_it_says_that_it_is_well() {
+        let (told, done) = obeyed(&[NONE_LIT, ALL_LIT], true);
+        assert!(!told.is_empty() && told.iter().all(|on| !on), "{told:?}");
+        assert!(matches!(done[..], [Report::Done(1), Report::Failed(2, LaserError::Lost)]), "{done:?}");
     }
 }

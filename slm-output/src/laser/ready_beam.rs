@@ -11,7 +11,7 @@ use holod_calibration::{Colour, PerColour, TimeNs};
 
 use super::line_link::Sharing;
 use super::mecom::{Reply, Request, frame, reply};
-use super::power_box::{Conversation, PowerBox, PowerDevice, put_out_beside, require_acceptance};
+use super::power_box::{Conversation, NONE_LIT, PowerBox, PowerDevice, put_out_beside, require_acceptance};
 use super::program::within_powers;
 use super::{LaserBox, LaserError};
 
@@ -58,6 +58,10 @@ pub(super) fn open(
     let port = Conversation::open(path, BAUD, Sharing::Alone, clock)?;
     let mut device = ReadyBeam { port, sequence: 0, recognised: false, answer_wait: ANSWER_WAIT, full_power_uw };
     device.recognise()?;
+    // Whatever is wrong with it, it does not stay lit.
+    let put_out = device.set_lit(NONE_LIT);
+    device.check()?;
+    put_out?;
     Ok(Box::new(PowerBox::new(device, lasers, clock)?))
 }
 
@@ -141,15 +145,16 @@ impl ReadyBeam {
         }
     }
 
-    fn switch(&mut self, colour: Colour, on: bool) -> Result<(), LaserError> {
-        self.write(LASER_ON, colour, u32::from(on))?;
-        let found = self.read(LASER_ON, instance(colour))?;
-        if found == u32::from(on) {
-            return Ok(());
+    /// Asks whether it is well.
+    fn check(&mut self) -> Result<(), LaserError> {
+        match self.read(STATUS, 1)? {
+            STATUS_ERROR => {
+                let (sent, found) = ("its status".into(), format!("{STATUS_ERROR} (error)"));
+                let expected = "a device without errors: check its interlock and its own software".into();
+                Err(LaserError::Complaint { path: self.port.path(), sent, found, expected })
+            }
+            _ => Ok(()),
         }
-        let sent = format!("{colour} {}", if on { "on" } else { "off" });
-        let (found, expected) = (found.to_string(), u32::from(on).to_string());
-        Err(LaserError::Complaint { path: self.port.path(), sent, found, expected })
     }
 
     fn complaint(&self, sent: String, reply: &Reply) -> LaserError {
@@ -180,18 +185,18 @@ impl PowerDevice for ReadyBeam {
         Ok(())
     }
 
-    fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
-        // Out before on, and all that can be put out is, even where one of them does not obey.
-        let mut put_out = Ok(());
-        for colour in Colour::ALL.into_iter().filter(|&colour| !lit[colour]) {
-            put_out = put_out.and(self.switch(colour, false));
-        }
-        put_out?;
-        for colour in Colour::ALL.into_iter().filter(|&colour| lit[colour]) {
+    fn switch(&mut self, colour: Colour, on: bool) -> Result<(), LaserError> {
+        if on {
             self.write(DIGITAL_CONTROL, colour, 1)?;
-            self.switch(colour, true)?;
         }
-        Ok(())
+        self.write(LASER_ON, colour, u32::from(on))?;
+        let found = self.read(LASER_ON, instance(colour))?;
+        if found == u32::from(on) {
+            return Ok(());
+        }
+        let sent = format!("{colour} {}", if on { "on" } else { "off" });
+        let (found, expected) = (found.to_string(), u32::from(on).to_string());
+        Err(LaserError::Complaint { path: self.port.path(), sent, found, expected })
     }
 
     fn dark_wait(&self) -> TimeNs {
@@ -200,13 +205,6 @@ impl PowerDevice for ReadyBeam {
     }
 
     fn probe(&mut self, _asked: usize) -> Result<bool, LaserError> {
-        match self.read(STATUS, 1)? {
-            STATUS_ERROR => {
-                let (sent, found) = ("its status".into(), format!("{STATUS_ERROR} (error)"));
-                let expected = "a device without errors: check its interlock and its own software".into();
-                Err(LaserError::Complaint { path: self.port.path(), sent, found, expected })
-            }
-            _ => Ok(true),
-        }
+        self.check().map(|()| true)
     }
 }

@@ -54,12 +54,12 @@ pub(super) fn open(
     // Whatever is wrong with one of them, no other stays lit.
     let put_out = open.set_lit(NONE_LIT);
     recognised.and(put_out)?;
-    for laser in open.0.0.iter_mut().flatten() {
-        for command in &profile.prepare {
-            laser.command(command)?;
-        }
-        laser.check()?;
-    }
+    let prepare = |laser: &mut TextLaser| profile.prepare.iter().try_for_each(|command| laser.command(command));
+    let prepared = open.0.0.iter_mut().flatten().try_for_each(prepare);
+    // One that was lit by that, such as by a change of its mode, does not stay lit.
+    let put_out = open.set_lit(NONE_LIT);
+    prepared.and(put_out)?;
+    open.0.0.iter_mut().flatten().try_for_each(TextLaser::check)?;
     Ok(Box::new(PowerBox::new(open, lasers, clock)?))
 }
 
@@ -124,7 +124,7 @@ impl TextLaser {
         if expect.accepts(&found) {
             return Ok(());
         }
-        let expected = format!("{}: check its interlock and its faults", text_of(expect));
+        let expected = format!("{}: check its interlock, faults and operating mode", text_of(expect));
         Err(LaserError::Complaint { path: self.port.path(), sent: ask.clone(), found, expected })
     }
 
@@ -181,20 +181,13 @@ impl PowerDevice for TextLasers {
         Ok(())
     }
 
-    fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
-        // Out before on, and all that can be put out is, even where one of them does not answer.
-        let mut put_out = Ok(());
-        for colour in Colour::ALL.into_iter().filter(|&colour| !lit[colour]) {
-            if let Some(laser) = &mut self.0[colour] {
-                put_out = put_out.and(laser.put_out());
-            }
+    fn switch(&mut self, colour: Colour, on: bool) -> Result<(), LaserError> {
+        match &mut self.0[colour] {
+            Some(laser) if on => laser.profile.on.clone().iter().try_for_each(|command| laser.command(command)),
+            Some(laser) => laser.put_out(),
+            None if on => Err(LaserError::NoLaser { colour }),
+            None => Ok(()),
         }
-        put_out?;
-        for colour in Colour::ALL.into_iter().filter(|&colour| lit[colour]) {
-            let Some(laser) = &mut self.0[colour] else { return Err(LaserError::NoLaser { colour }) };
-            laser.profile.on.clone().iter().try_for_each(|command| laser.command(command))?;
-        }
-        Ok(())
     }
 
     fn dark_wait(&self) -> TimeNs {
