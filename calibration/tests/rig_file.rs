@@ -922,10 +922,15 @@ fn a_table_of_few_levels_all_round_has_no_short_stroke() {
         let rows = (0..32).map(|step| format!("{},{}\n", 8 * step, f64::from(of_step(step)) * TAU / 32.0));
         load_sparse_lut(&rows.collect::<String>()).unwrap()
     };
-    for rig in [eighth(|step| step), eighth(|step| step * 5 % 32)] {
+    for (rig, is_in_order) in [(eighth(|step| step), true), (eighth(|step| step * 5 % 32), false)] {
         assert_eq!(strokes_told(&rig), Vec::<String>::new());
-        let [few] = rig.warnings().try_into().unwrap();
-        assert!(few.starts_with("green: of 256 levels only the 32 in the table are used"), "{few}");
+        let told = rig.warnings();
+        assert!(told[0].starts_with("green: of 256 levels only the 32 in the table are used"), "{told:?}");
+        match &told[1..] {
+            [] => assert!(is_in_order),
+            [unsigned] => assert!(!is_in_order && unsigned.contains("phase_sign is not applied"), "{unsigned}"),
+            more => panic!("{more:?}"),
+        }
     }
     // Of steps 0 to 3 none.
     let [green] = strokes_told(&eighth(|step| 4 + step * 5 % 28)).try_into().unwrap();
@@ -1020,6 +1025,26 @@ fn sixteen_bits_have_a_table_of_65536_levels_at_most() {
     assert!(one_too_many.to_string().contains("row 65537 `6.5536"), "{one_too_many}");
     let rig = parse(rows.rsplit_once("6.5536").unwrap().0).unwrap();
     assert_eq!((rig.panel.packing, rig.panel.lut[Colour::Green].as_ref().unwrap().len()), (Packing::Red8Green8, 65536));
+}
+
+/// Of phases in any order neither the sign nor the first turn is known, and one noisy reading is not that.
+#[test]
+fn a_table_of_few_levels_that_steps_back_a_little_is_a_fault() {
+    let table = |noise: f64| {
+        let phase = |level: usize| if level == 8 { -noise } else { (level as f64 / 248.0).powi(2) * 2.257 * PI };
+        (0..32).map(|step| format!("{},{:.4}\n", 8 * step, phase(8 * step))).collect::<String>()
+    };
+    let [fault] = load_sparse_lut(&table(0.004)).unwrap_err().faults.try_into().unwrap();
+    assert_eq!(fault.key, "panel.lut_file.green");
+    assert!(fault.found.contains("phase 0 at level 0, phase -0.004 at level 8"), "{fault}");
+    assert_eq!(fault.advice, "smooth the measurement, or leave out level 8");
+    let smooth: String =
+        table(0.004).lines().filter(|row| !row.starts_with("8,")).map(|row| format!("{row}\n")).collect();
+    let told = load_sparse_lut(&smooth).unwrap().warnings();
+    assert!(!told.iter().any(|told| told.contains("phase_sign")), "{told:?}");
+    // Steps back of a tenth of the range are an order of its own.
+    let told = load_sparse_lut(&table(0.8)).unwrap().warnings();
+    assert!(told.iter().any(|told| told.contains("phase_sign is not applied")), "{told:?}");
 }
 
 #[test]

@@ -12,6 +12,9 @@ const ROWS_QUOTED_MAX: usize = 3;
 const PHASE_MAX_RAD: f64 = 16.0 * PI;
 /// Tables of the first 2^k levels are those of a panel with k bits from so many on.
 const OTHER_DEPTH_MIN: usize = 64;
+/// A table of some levels that steps back by no more than this share of its range in all is one in order, measured with
+/// some noise.
+const NOISE_SHARE_MAX: f64 = 0.05;
 /// A panel of one level shows nothing.
 const LEVELS_MIN: usize = 2;
 
@@ -21,11 +24,12 @@ const LEVELS_MIN: usize = 2;
 /// - every level: a row for each from 0 up, `level,phase_rad` or `phase_rad` alone. The phase may rise or fall with the
 ///   level but not both.
 /// - some levels, for a panel with few and irregular ones: a row `level,phase_rad` for each that may be used, the
-///   levels rising, the phases in any order.
+///   levels rising, the phases in any order. Phases that are in order but for little steps back are noise, and a fault:
+///   in any order neither the sign nor the first turn of several can be told.
 ///
 /// # Errors
 /// [`FileFault`] where it has a row that is no number or out of order, has too few or too many
-/// rows, or names every level and is not monotonic.
+/// rows, names every level and is not monotonic, or names some and is nearly so.
 pub(super) fn read(path: &Path, text: &str, bit_depth: u8) -> Result<Vec<LevelPhase>, FileFault> {
     let levels = 1usize << bit_depth;
     let mut table: Vec<LevelPhase> = Vec::new();
@@ -81,10 +85,18 @@ pub(super) fn read(path: &Path, text: &str, bit_depth: u8) -> Result<Vec<LevelPh
     let turns_round = |pair: &[LevelPhase]| {
         if falls { pair[1].phase_rad > pair[0].phase_rad } else { pair[1].phase_rad < pair[0].phase_rad }
     };
-    if let Some(broken) = table.windows(2).find(|pair| complete && turns_round(pair)) {
+    let phases_rad = || table.iter().map(|entry| entry.phase_rad);
+    let range_rad = phases_rad().fold(f64::MIN, f64::max) - phases_rad().fold(f64::MAX, f64::min);
+    let steps_back = || table.windows(2).filter(|pair| turns_round(pair));
+    let back_rad: f64 = steps_back().map(|pair| (pair[1].phase_rad - pair[0].phase_rad).abs()).sum();
+    if let Some(broken) = steps_back().next().filter(|_| complete || back_rad <= NOISE_SHARE_MAX * range_rad) {
         let [before, after] =
             [broken[0], broken[1]].map(|LevelPhase { level, phase_rad }| format!("phase {phase_rad} at level {level}"));
-        return Err(fault(format!("{before}, {after}"), "smooth the measurement or unwrap its phase"));
+        let advice = match complete {
+            true => "smooth the measurement or unwrap its phase".to_owned(),
+            false => format!("smooth the measurement, or leave out level {}", broken[1].level),
+        };
+        return Err(fault(format!("{before}, {after}"), &advice));
     }
     Ok(table)
 }

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{LaserDriver, Lasers, Orientation, Panel, PanelMode, PanelProfile, Rig, Tracker, VideoMargins};
+use super::{LaserDriver, Lasers, LevelPhase, Orientation, Panel, PanelMode, PanelProfile, Rig, Tracker, VideoMargins};
 use crate::{Colour, PerColour, PupilDiameter, Resolution, TimeNs};
 
 /// The pupils for which blur is worked out.
@@ -399,6 +399,13 @@ impl Panel {
         warnings.extend(tables.filter(|(_, named)| *named < levels).map(|(colour, named)| {
             format!("{colour}: of {levels} levels only the {named} in the table are used; none is put between them")
         }));
+        let is_unordered = |colour: &Colour| self.lut[*colour].as_ref().is_some_and(|table| !is_in_order(table));
+        warnings.extend(colours.iter().copied().filter(is_unordered).map(|colour| {
+            format!(
+                "{colour}: the phases in the table neither rise nor fall with the level: they are taken as they stand, \
+                 and phase_sign is not applied to them"
+            )
+        }));
         warnings
     }
 
@@ -409,7 +416,7 @@ impl Panel {
             return [TAU - stroke_rad, stroke_rad / f64::from((1u32 << self.bit_depth) - 1)];
         };
         let mut phases_rad: Vec<f64> = table.iter().map(|entry| entry.phase_rad).collect();
-        if phases_rad.is_sorted() || phases_rad.is_sorted_by(|a, b| a >= b) {
+        if is_in_order(table) {
             let step_rad = phases_rad.windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max);
             return [TAU - stroke_rad, step_rad];
         }
@@ -461,6 +468,12 @@ impl Panel {
         });
         told.collect()
     }
+}
+
+/// Whether the phase rises or falls with the level throughout.
+pub(super) fn is_in_order(table: &[LevelPhase]) -> bool {
+    let phases_rad = || table.iter().map(|entry| entry.phase_rad);
+    phases_rad().is_sorted() || phases_rad().is_sorted_by(|a, b| a >= b)
 }
 
 fn milliseconds(TimeNs(ns): TimeNs) -> f64 {

@@ -8,6 +8,7 @@ use twox_hash::XxHash3_64;
 
 use super::files::{PICTURE_BYTES_MAX, TEXT_BYTES_MAX, plain_file, read_bytes, read_text, text_of};
 use super::flatness::GrayScale;
+use super::meaning::is_in_order;
 use super::profile::PanelProfile;
 use super::reader::{Found, Reader, Section, Span};
 use super::{
@@ -545,7 +546,7 @@ impl TableRange {
 
 fn table_range(table: &[LevelPhase]) -> TableRange {
     let phases = || table.iter().map(|entry| entry.phase_rad);
-    if phases().is_sorted() || phases().is_sorted_by(|a, b| a >= b) {
+    if is_in_order(table) {
         return TableRange::Signed(table[table.len() - 1].phase_rad - table[0].phase_rad);
     }
     TableRange::Unordered(phases().fold(f64::MIN, f64::max) - phases().fold(f64::MAX, f64::min))
