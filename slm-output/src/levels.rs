@@ -634,9 +634,10 @@ fn level_table(signed: &[LevelPhase], bit_depth: u8, out_of_stroke: OutOfStroke)
         let phase_rad = (entry as f64 + 0.5) * entry_rad;
         let round_rad = (arc.sense * (phase_rad - arc.start_rad)).rem_euclid(TAU);
         let (nearest, distance_rad) = arc.nearest(round_rad);
-        let out_of_reach = distance_rad > reach_rad;
+        let is_scaled = out_of_stroke == OutOfStroke::Scale && has_gap;
+        let out_of_reach = distance_rad > reach_rad && !is_scaled;
         let level = match out_of_stroke {
-            OutOfStroke::Scale if has_gap => arc.nearest(round_rad * length_rad / TAU).0,
+            OutOfStroke::Scale if is_scaled => arc.nearest(round_rad * length_rad / TAU).0,
             OutOfStroke::Clip if out_of_reach => last,
             OutOfStroke::Zero if out_of_reach => arc.levels[0].1,
             _ => nearest,
@@ -761,7 +762,9 @@ mod tests {
             };
             let (levels, unreachable) = encoded(&panel, &turns);
             assert_eq!(levels, expected, "{out_of_stroke:?}");
-            assert_eq!(unreachable, if negative { 0.0 } else { 0.4 }, "{out_of_stroke:?}");
+            // Where every phase is scaled none is out of reach.
+            let all_are_reached = negative || out_of_stroke == OutOfStroke::Scale;
+            assert_eq!(unreachable, if all_are_reached { 0.0 } else { 0.4 }, "{out_of_stroke:?}");
         }
         let beyond = [0.2, 0.1].map(|turns: f32| turns * TAU as f32);
         let panel = Panel {
