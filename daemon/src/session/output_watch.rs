@@ -1,7 +1,7 @@
 //! What a person should hear of the panel and the lasers while the loop runs.
 
 use holod_calibration::TimeNs;
-use holod_calibration::rig::RATE_TOLERANCE;
+use holod_calibration::rig::{Panel, PanelMode, RATE_TOLERANCE};
 use holod_slm_output::PanelEvent;
 use holod_slm_output::laser::DarkReason;
 use holod_slm_output::output::FieldEvent;
@@ -19,6 +19,7 @@ pub(super) struct OutputWatch {
     events: rtrb::Consumer<PanelEvent>,
     /// Refreshes a second that the rig names.
     nominal_hz: f64,
+    mode: PanelMode,
     lost: Option<PanelFault>,
     /// Whether software's times are good enough to light lasers by.
     takes_software_times: bool,
@@ -36,10 +37,11 @@ pub(super) struct OutputWatch {
 }
 
 impl OutputWatch {
-    pub(super) fn new(events: rtrb::Consumer<PanelEvent>, nominal_hz: f64, takes_software_times: bool) -> Self {
+    pub(super) fn new(events: rtrb::Consumer<PanelEvent>, panel: &Panel, takes_software_times: bool) -> Self {
         Self {
             events,
-            nominal_hz,
+            nominal_hz: panel.refresh_hz,
+            mode: panel.mode,
             lost: None,
             takes_software_times,
             are_times_good: false,
@@ -118,11 +120,11 @@ impl OutputWatch {
         self.said.push(reason);
         Some(match reason {
             DarkReason::Untrusted if is_all => {
-                let why = why_unbelieved(field.provenance);
+                let why = self.why_unbelieved(field.provenance);
                 format!("no report of the panel's refreshes is believed, so lasers stay dark: {why}")
             }
             DarkReason::Untrusted => {
-                let why = why_unbelieved(field.provenance);
+                let why = self.why_unbelieved(field.provenance);
                 format!("few reports of the panel's refreshes are believed, so lasers flicker: {why}")
             }
             reason => {
@@ -130,6 +132,27 @@ impl OutputWatch {
                 format!("{fields}: {reason} ({}){}", reason.meaning(), cure(reason))
             }
         })
+    }
+
+    fn why_unbelieved(&self, provenance: TimestampSource) -> String {
+        match provenance {
+            TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => {
+                let wire = match self.mode {
+                    PanelMode::ChannelPacked => {
+                        ", and a wire from the panel's sync output to the laser box (lasers.sync_wire) needs none"
+                    }
+                    PanelMode::FieldSequential | PanelMode::Monochrome(_) => "",
+                };
+                format!(
+                    "their times scatter by more than the rig leaves room for; a longer lasers.on_delay_ms and a shorter \
+                     lit_ms leave more{wire}"
+                )
+            }
+            TimestampSource::Software | TimestampSource::Estimated => {
+                "their times are software's, not the display's, or scatter; `holod check` says what an output is good for"
+                    .into()
+            }
+        }
     }
 
     /// Why no field is lit though lasers may be, where that is so.
@@ -187,18 +210,6 @@ impl FieldsSeen {
     }
 }
 
-const fn why_unbelieved(provenance: TimestampSource) -> &'static str {
-    match provenance {
-        TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => {
-            "their times scatter by more than the rig leaves room for; a longer lasers.on_delay_ms and a shorter lit_ms \
-             leave more, and a wire from the panel's sync output to the laser box (lasers.sync_wire) needs none"
-        }
-        TimestampSource::Software | TimestampSource::Estimated => {
-            "their times are software's, not the display's, or scatter; `holod check` says what an output is good for"
-        }
-    }
-}
-
 /// What helps against it, as the end of a sentence.
 const fn cure(reason: DarkReason) -> &'static str {
     match reason {
@@ -218,11 +229,12 @@ const fn cure(reason: DarkReason) -> &'static str {
 #[cfg(test)]
 mod tests {
     use holod_calibration::Colour;
+    use holod_calibration::rig::Rig;
 
     use super::*;
 
     fn watch() -> OutputWatch {
-        OutputWatch::new(rtrb::RingBuffer::new(1).1, 60.0, false)
+        OutputWatch::new(rtrb::RingBuffer::new(1).1, &Rig::default().panel, false)
     }
 
     /// The field of this number, of 180 a second.
@@ -283,6 +295,15 @@ mod tests {
             assert!(watch.unlit().unwrap().starts_with(&format!("no field is lit: {reason} (")));
             assert_eq!(said(&mut watch, 1, |_| None), [""; 0]);
             assert_eq!(watch.unlit(), None);
+        }
+    }
+
+    #[test]
+    fn a_sync_wire_is_named_only_where_it_does_something() {
+        for (mode, named) in [(PanelMode::ChannelPacked, true), (PanelMode::FieldSequential, false)] {
+            let mut watch = OutputWatch { mode, ..watch() };
+            let [told] = said(&mut watch, 0, |_| Some(DarkReason::Untrusted)).try_into().unwrap();
+            assert_eq!(told.contains("sync_wire"), named, "{told}");
         }
     }
 
