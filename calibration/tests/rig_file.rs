@@ -84,7 +84,8 @@ fn the_example_rig_says_what_its_comments_say() {
     assert!((meaning.u_near_mm - 4.571).abs() < 1e-3 && meaning.u_far_mm == 0.0 && meaning.depth_far_m.is_none());
     assert!((meaning.eyebox_mm.blue - 2.25).abs() < 1e-9);
     assert!((meaning.blurs[0].largest_blur_px - 2.0 / 0.35 / 0.2).abs() < 1e-3);
-    assert!((meaning.field.laser_on_ms - 2.1).abs() < 1e-9 && (meaning.field.laser_off_ms - 5.1).abs() < 1e-9);
+    let [on_ms, off_ms] = [meaning.field.laser_on_ms, meaning.field.laser_off_ms].map(Option::unwrap);
+    assert!((on_ms - 2.1).abs() < 1e-9 && (off_ms - 5.1).abs() < 1e-9);
     assert!(meaning.files.is_empty());
 }
 
@@ -687,13 +688,112 @@ fn lasers_without_a_heartbeat_are_taken_only_where_the_rig_accepts_that_in_words
             LaserDriver::ReadyBeam { path, full_power_uw } => {
                 assert_eq!((path.to_str(), full_power_uw), (Some("/dev/x"), PerColour([40_000, 30_000, 50_500])));
             }
-            LaserDriver::Text { profile, paths } => {
+            LaserDriver::Text { profile, paths, transmission_ppb } => {
+                assert_eq!(transmission_ppb, PerColour([1_000_000_000; 3]));
                 assert_eq!(profile.as_ref(), TextLaserProfile::named("cobolt").unwrap());
                 assert_eq!(paths, PerColour([None, Some("/dev/g".into()), Some("/dev/b".into())]));
             }
             other => panic!("{other:?}"),
         }
     }
+}
+
+const GREEN_ALONE: (&str, &str) = ("mode = \"channel-packed\"", "mode = \"monochrome\"\ncolour = \"green\"");
+const SEQUENTIAL: (&str, &str) = ("mode = \"channel-packed\"", "mode = \"field-sequential\"");
+
+#[test]
+fn lasers_that_are_on_while_armed_are_lit_all_the_time() {
+    let one = format!("driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ green = \"/dev/g\" }}\n{ACCEPTED}");
+    let driver = |lines: &str| format!("{one}\n{lines}");
+    let windowless = [("on_delay_ms = 0.1\n", ""), ("lit_ms = 3.0\n", "")];
+    let rig = |changes: &[(&str, &str)]| Rig::parse(&changed(changes), Path::new("")).unwrap();
+    let alone = driver("");
+    let power = ("power_mw = { red = 1.0, green = 1.0, blue = 1.0 }", "power_mw = { green = 1.0 }");
+    let meaning = rig(&[GREEN_ALONE, ("driver = \"simulated\"", &alone), power]).meaning();
+    let text = meaning.to_string();
+    for part in [
+        "in one field   settled at 2.000 ms; the laser is on while it is armed: lit for 100 % of it",
+        "\npower          green 1 mW without a power_limit_mw (500 at most)\n",
+    ] {
+        assert!(text.contains(part), "{part} is not in\n{text}");
+    }
+    assert!(!text.contains("red 1 mW") && !text.contains("so this colour stays dark"), "{text}");
+    let json = serde_json::to_value(&meaning).unwrap();
+    assert_eq!((&json["field"]["lit_share"], &json["field"]["time_share"]), (&json!(1.0), &json!(1.0)));
+    for key in ["laser_on_ms", "laser_off_ms", "gated_by"] {
+        assert_eq!(json["field"][key], json!(null), "{key}");
+    }
+    assert_eq!(json["lasers"]["power_mw"], json!({"red": null, "green": 1.0, "blue": null}));
+    // Nothing is switched by the keys of a window, and so none of them is asked for.
+    let windowless = rig(&[GREEN_ALONE, ("driver = \"simulated\"", &alone), windowless[0], windowless[1]]);
+    assert_eq!(windowless.meaning().field, meaning.field);
+    assert!(!windowless.meaning().to_string().contains("is cut"));
+    let asked = faults_of(&changed(&[("lit_ms = 3.0\n", "")]));
+    assert_eq!(asked[0].key, "lasers.lit_ms", "of lasers that are lit field by field");
+
+    let gated = driver("gated_by_panel = true");
+    let packed = rig(&[("driver = \"simulated\"", &gated)]).meaning();
+    assert!(packed.to_string().contains("settled at 2.000 ms; lit as the panel gates the lasers"), "{packed}");
+    let json = serde_json::to_value(&packed).unwrap();
+    assert_eq!((&json["field"]["gated_by"], &json["field"]["lit_share"]), (&json!("panel"), &json!(null)));
+    let alone = rig(&[GREEN_ALONE, ("driver = \"simulated\"", &gated)]).meaning();
+    assert_eq!(alone.field.lit_share, Some(1.0));
+    assert!(alone.notes.iter().any(|note| note.starts_with("gated_by_panel is without effect")), "{:?}", alone.notes);
+    // Of several lasers one is shown in this mode.
+    let all = rig(&[GREEN_ALONE]).meaning().to_string();
+    assert!(all.contains("lit for 18 % of it, each colour for 18 % of the time"), "{all}");
+    assert!(rig(&[]).meaning().to_string().contains("lit for 54 % of it, each colour for 18 % of the time"));
+    assert!(all.contains("red 1 mW without a power_limit_mw (500 at most), not lit in this mode, green 1 mW"), "{all}");
+}
+
+#[test]
+fn what_a_panel_does_in_channel_packed_mode_alone_is_refused_in_the_others() {
+    let beam = "driver = \"ready-beam\"\ndevice = \"/dev/x\"\nfull_power_mw = { red = 9, green = 9, blue = 9 }";
+    let gated = format!("{beam}\n{ACCEPTED}\ngated_by_panel = true");
+    let wired = "driver = \"serial\"\ndevice = \"/dev/x\"\nsync_wire = true";
+    for (lines, mode, key, advice) in [
+        (gated.as_str(), SEQUENTIAL, "gated_by_panel", "show one colour"),
+        (wired, SEQUENTIAL, "sync_wire", "take it out"),
+        (wired, GREEN_ALONE, "sync_wire", "take it out"),
+    ] {
+        let text = changed(&[mode, ("driver = \"simulated\"", lines)]);
+        let [fault] = faults_of(&text).try_into().unwrap();
+        assert_eq!((fault.key, fault.line.is_some()), (format!("lasers.{key}"), true));
+        assert!(fault.found.contains("true in ") && fault.expected.contains("channel-packed"), "{}", fault.expected);
+        assert!(fault.advice.contains(advice), "{}", fault.advice);
+        with_driver(lines).unwrap();
+    }
+    let late =
+        changed(&[SEQUENTIAL, ("refresh_hz = 60.0", "refresh_hz = 180.0"), ("settle_ms = 2.0", "settle_ms = 7.5")]);
+    let [fault] = faults_of(&late).try_into().unwrap();
+    assert!(fault.advice.contains("shows its video a frame later"), "{}", fault.advice);
+}
+
+#[test]
+fn a_laser_is_told_what_brings_its_power_to_the_panel() {
+    let text = "driver = \"text\"\nprofile = \"cobolt\"\ndevices = { green = \"/dev/g\", blue = \"/dev/b\" }";
+    let given = |lines: &str| with_driver(&format!("{text}\n{lines}\n{ACCEPTED}"));
+    let rig = given("transmission = { green = 0.3 }").unwrap();
+    let driver = &rig.lasers.driver;
+    let told = |colour, uw| driver.head_power_uw(colour, uw).unwrap();
+    // Never more than that.
+    assert_eq!((told(Colour::Green, 300), told(Colour::Green, 1000), told(Colour::Blue, 1000)), (1000, 3333, 1000));
+    let meaning = rig.meaning();
+    assert!(meaning.to_string().contains("\nat the laser   green 3.333 mW, blue 1 mW\n"), "{meaning}");
+    assert_eq!(meaning.lasers.power_mw.green, Some(1.0), "at the panel, as ever");
+    let noted: Vec<_> = meaning.notes.iter().filter(|note| note.contains("transmission")).collect();
+    assert!(matches!(&noted[..], [note] if note.starts_with("blue: ")), "{noted:?}");
+    for (lines, key, words) in [
+        ("transmission = { green = 30 }", "transmission.green", "percent"),
+        ("transmission = { green = 0 }", "transmission.green", ""),
+        ("transmission = { red = 0.3 }", "transmission.red", "name its port"),
+        ("full_power_mw = { red = 9, green = 9, blue = 9 }", "full_power_mw", "ready-beam"),
+    ] {
+        let [fault] = given(lines).unwrap_err().faults.try_into().unwrap();
+        assert_eq!(fault.key, format!("lasers.{key}"));
+        assert!(fault.advice.contains(words), "{fault}");
+    }
+    assert_eq!(Rig::default().lasers.driver.head_power_uw(Colour::Green, 1000), None);
 }
 
 #[test]
@@ -937,6 +1037,26 @@ fn a_table_of_few_levels_all_round_has_no_short_stroke() {
     assert!(green.starts_with("green: the panel's stroke is 1.688 π"), "{green}");
 }
 
+/// Of phases in any order neither the sign nor the first turn is known, and one noisy reading is not that.
+#[test]
+fn a_table_of_few_levels_that_steps_back_a_little_is_a_fault() {
+    let table = |noise: f64| {
+        let phase = |level: usize| if level == 8 { -noise } else { (level as f64 / 248.0).powi(2) * 2.257 * PI };
+        (0..32).map(|step| format!("{},{:.4}\n", 8 * step, phase(8 * step))).collect::<String>()
+    };
+    let [fault] = load_sparse_lut(&table(0.004)).unwrap_err().faults.try_into().unwrap();
+    assert_eq!(fault.key, "panel.lut_file.green");
+    assert!(fault.found.contains("phase 0 at level 0, phase -0.004 at level 8"), "{fault}");
+    assert_eq!(fault.advice, "smooth the measurement, or leave out level 8");
+    let smooth: String =
+        table(0.004).lines().filter(|row| !row.starts_with("8,")).map(|row| format!("{row}\n")).collect();
+    let told = load_sparse_lut(&smooth).unwrap().warnings();
+    assert!(!told.iter().any(|told| told.contains("phase_sign")), "{told:?}");
+    // Steps back of a tenth of the range are an order of its own.
+    let told = load_sparse_lut(&table(0.8)).unwrap().warnings();
+    assert!(told.iter().any(|told| told.contains("phase_sign is not applied")), "{told:?}");
+}
+
 #[test]
 fn a_table_for_a_panel_of_fewer_bits_is_refused() {
     for (bits, rows) in [(7, 128), (6, 64)] {
@@ -1025,26 +1145,6 @@ fn sixteen_bits_have_a_table_of_65536_levels_at_most() {
     assert!(one_too_many.to_string().contains("row 65537 `6.5536"), "{one_too_many}");
     let rig = parse(rows.rsplit_once("6.5536").unwrap().0).unwrap();
     assert_eq!((rig.panel.packing, rig.panel.lut[Colour::Green].as_ref().unwrap().len()), (Packing::Red8Green8, 65536));
-}
-
-/// Of phases in any order neither the sign nor the first turn is known, and one noisy reading is not that.
-#[test]
-fn a_table_of_few_levels_that_steps_back_a_little_is_a_fault() {
-    let table = |noise: f64| {
-        let phase = |level: usize| if level == 8 { -noise } else { (level as f64 / 248.0).powi(2) * 2.257 * PI };
-        (0..32).map(|step| format!("{},{:.4}\n", 8 * step, phase(8 * step))).collect::<String>()
-    };
-    let [fault] = load_sparse_lut(&table(0.004)).unwrap_err().faults.try_into().unwrap();
-    assert_eq!(fault.key, "panel.lut_file.green");
-    assert!(fault.found.contains("phase 0 at level 0, phase -0.004 at level 8"), "{fault}");
-    assert_eq!(fault.advice, "smooth the measurement, or leave out level 8");
-    let smooth: String =
-        table(0.004).lines().filter(|row| !row.starts_with("8,")).map(|row| format!("{row}\n")).collect();
-    let told = load_sparse_lut(&smooth).unwrap().warnings();
-    assert!(!told.iter().any(|told| told.contains("phase_sign")), "{told:?}");
-    // Steps back of a tenth of the range are an order of its own.
-    let told = load_sparse_lut(&table(0.8)).unwrap().warnings();
-    assert!(told.iter().any(|told| told.contains("phase_sign is not applied")), "{told:?}");
 }
 
 #[test]

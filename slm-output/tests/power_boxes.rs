@@ -225,6 +225,7 @@ fn text_lasers(profile: &str, paths: [Option<&Bench>; 3]) -> LaserDriver {
     LaserDriver::Text {
         profile: Box::new(TextLaserProfile::named(profile).unwrap().clone()),
         paths: PerColour(paths.map(|bench| bench.map(|bench| bench.path.clone()))),
+        transmission_ppb: PerColour([1_000_000_000; 3]),
     }
 }
 
@@ -333,6 +334,15 @@ fn text_lasers_are_recognised_put_out_set_lit_and_put_out() {
         assert!(!bench.with(|device| device.lit), "{name}: a laser without power stays off");
         assert_eq!(bench.with(|device| device.power_w.clone()), "0.001000", "{name}: and is told none");
         laser.dark(DarkReason::Asked, host_now()).unwrap();
+        drop(laser);
+        // A third of what the laser gives gets to the panel.
+        let mut behind_a_fibre = driver.clone();
+        if let LaserDriver::Text { transmission_ppb, .. } = &mut behind_a_fibre {
+            transmission_ppb[Colour::Green] = 333_333_333;
+        }
+        let mut laser = open_laser(&lasers(behind_a_fibre), host_now).unwrap();
+        laser.program(&program(GREEN), host_now()).unwrap();
+        assert_eq!(bench.with(|device| device.power_w.clone()), "0.003000", "{name}");
 
         let missing = laser.program(&program(PanelMode::Monochrome(Colour::Red)), host_now()).unwrap_err();
         assert!(matches!(missing, LaserError::NoLaser { colour: Colour::Red }), "{missing}");

@@ -126,12 +126,17 @@ pub struct FieldMeaning {
     pub period_ms: f64,
     /// When the phase has settled.
     pub settled_ms: f64,
-    /// When the laser goes on.
-    pub laser_on_ms: f64,
-    /// When the laser goes off.
-    pub laser_off_ms: f64,
-    /// Share of the field for which the laser is lit.
-    pub lit_share: f64,
+    /// Who lights the laser for this field alone: `laser-box` or `panel`; absent where it is on while it is armed.
+    pub gated_by: Option<&'static str>,
+    /// When the laser goes on; absent where no box switches it for this field.
+    pub laser_on_ms: Option<f64>,
+    /// When the laser goes off; absent likewise.
+    pub laser_off_ms: Option<f64>,
+    /// Share of the field for which the laser is lit: 1 where it is on while it is armed. Absent where the panel gates
+    /// it, which holod does not know the times of.
+    pub lit_share: Option<f64>,
+    /// Share of all time for which one colour is lit; absent likewise.
+    pub time_share: Option<f64>,
 }
 
 /// A video frame that is larger than the panel.
@@ -154,10 +159,14 @@ pub struct LaserMeaning {
     pub driver: String,
     /// The ports that it uses.
     pub ports: Vec<PathBuf>,
-    /// Optical power at the panel while a colour is lit.
-    pub power_mw: PerColourFigures,
-    /// Greatest power that the rig allows; absent where it says none.
+    /// Optical power at the panel while a colour is lit; absent of a laser that is not there.
+    pub power_mw: PerColourFigures<Option<f64>>,
+    /// Greatest power that the rig allows; absent where it says none, and of a laser that is not there.
     pub power_limit_mw: PerColourFigures<Option<f64>>,
+    /// What the laser itself is told, of those that are told another power than that at the panel.
+    pub head_power_mw: PerColourFigures<Option<f64>>,
+    /// The one colour that the panel's mode shows, in monochrome mode.
+    pub shown: Option<&'static str>,
     /// What holds in place of a limit that is absent.
     pub power_max_mw: f64,
     /// Power at the panel of lasers that are set to 100 %, of those that are set in percent.
@@ -242,7 +251,7 @@ impl Meaning {
             panel_half_angle_mrad: panel_half_angle.map(|angle_rad| angle_rad * 1e3).into(),
             blurs: blurs.to_vec(),
             field: FieldMeaning::of(rig),
-            lasers: LaserMeaning::of(&rig.lasers),
+            lasers: LaserMeaning::of(&rig.lasers, rig.panel.mode),
             tracker: TrackerMeaning::of(&rig.tracker),
             pupil_step_mm: rig.pupil_step().0 * 1e3,
             pupil_step_px: geometry.largest_coc_px(PupilDiameter::from_mm((rig.pupil_step().0 * 1e3) as f32)),
@@ -281,6 +290,19 @@ impl FieldMeaning {
         let settled_ms = milliseconds(panel.settle);
         let laser_on_ms = settled_ms + milliseconds(rig.lasers.on_delay);
         let lit_ms = milliseconds(rig.lasers.width);
+        let gated_by = match &rig.lasers {
+            lasers if lasers.driver.gates_fields() => Some("laser-box"),
+            lasers if lasers.gated_by_panel && panel.mode == PanelMode::ChannelPacked => Some("panel"),
+            _ => None,
+        };
+        let by_box = gated_by == Some("laser-box");
+        let share = |of_box: f64| match gated_by {
+            None => Some(1.0),
+            Some(_) => by_box.then_some(of_box),
+        };
+        let lit_share = lit_ms / period_ms;
+        let first = panel.colour_of_field(0);
+        let fields_of_colour = (0..panel.fields()).filter(|&field| panel.colour_of_field(field) == first).count();
         Self {
             mode: panel.mode.name().into(),
             refresh_hz: panel.refresh_hz,
@@ -289,25 +311,38 @@ impl FieldMeaning {
             channels: (panel.mode == PanelMode::ChannelPacked).then(|| panel.channel_order.map(Colour::name)),
             period_ms,
             settled_ms,
-            laser_on_ms,
-            laser_off_ms: laser_on_ms + lit_ms,
-            lit_share: lit_ms / period_ms,
+            gated_by,
+            lit_share: share(lit_share),
+            time_share: share(lit_share * fields_of_colour as f64 / panel.fields() as f64),
+            laser_on_ms: by_box.then_some(laser_on_ms),
+            laser_off_ms: by_box.then_some(laser_on_ms + lit_ms),
         }
     }
 }
 
 impl LaserMeaning {
-    fn of(lasers: &Lasers) -> Self {
+    fn of(lasers: &Lasers, mode: PanelMode) -> Self {
         let Lasers { driver, power_mw, power_limit_mw, heartbeat_timeout, stall_timeout, .. } = lasers;
         let full_power_mw = match driver {
             LaserDriver::ReadyBeam { full_power_uw, .. } => Some(full_power_uw.map(|uw| f64::from(uw) / 1e3).into()),
             _ => None,
         };
+        let of_lasers = |figure: &dyn Fn(Colour) -> Option<f64>| {
+            PerColour(Colour::ALL.map(|colour| driver.has(colour).then(|| figure(colour)).flatten())).into()
+        };
         Self {
             driver: driver.name().into(),
             ports: driver.paths().into_iter().map(PathBuf::from).collect(),
-            power_mw: (*power_mw).into(),
-            power_limit_mw: (*power_limit_mw).into(),
+            power_mw: of_lasers(&|colour| Some(power_mw[colour])),
+            power_limit_mw: of_lasers(&|colour| power_limit_mw[colour]),
+            head_power_mw: of_lasers(&|colour| {
+                let head_uw = driver.head_power_uw(colour, Lasers::whole_uw(power_mw[colour]))?;
+                Some(head_uw as f64 / 1e3)
+            }),
+            shown: match mode {
+                PanelMode::Monochrome(colour) => Some(colour.name()),
+                PanelMode::ChannelPacked | PanelMode::FieldSequential => None,
+            },
             power_max_mw: Lasers::POWER_MAX_MW,
             full_power_mw,
             heartbeat_timeout_ms: driver.has_heartbeat().then(|| milliseconds(*heartbeat_timeout)),
@@ -498,7 +533,7 @@ fn active_files(rig: &Rig) -> Vec<ActiveFile> {
 fn notes(rig: &Rig) -> Vec<String> {
     let mut notes = Vec::new();
     notes.extend(rig.warnings());
-    for (colour, power_mw) in rig.lasers.power_mw.iter() {
+    for (colour, power_mw) in rig.lasers.power_mw.iter().filter(|(colour, _)| rig.lasers.driver.has(*colour)) {
         if *power_mw == 0.0 {
             notes.push(format!("{colour}: the laser's power is 0, so this colour stays dark"));
         }
@@ -509,7 +544,7 @@ fn notes(rig: &Rig) -> Vec<String> {
     }
     let slack = rig.panel.mode.window_slack(rig.panel.field_period());
     let room = rig.panel.field_period() - rig.panel.settle - rig.lasers.on_delay - slack;
-    if rig.lasers.width > room {
+    if rig.lasers.width > room && rig.lasers.driver.gates_fields() {
         notes.push(format!(
             "lit_ms is cut to {:.3}: a window ends {:.3} ms before its field at least, for a panel that is a little fast",
             room.0.max(0) as f64 / 1e6,
@@ -524,6 +559,23 @@ fn notes(rig: &Rig) -> Vec<String> {
              optics allow an eye",
             unlimited.join(", "),
             Lasers::POWER_MAX_MW
+        ));
+    }
+    if rig.lasers.gated_by_panel && rig.panel.mode != PanelMode::ChannelPacked {
+        notes.push("gated_by_panel is without effect in this mode, in which lasers are on while they are armed".into());
+    }
+    let at_the_head = |colour: &Colour| match &rig.lasers.driver {
+        LaserDriver::Text { transmission_ppb, .. } => {
+            rig.lasers.driver.has(*colour) && transmission_ppb[*colour] == 1_000_000_000
+        }
+        _ => false,
+    };
+    let at_the_head: Vec<&str> = Colour::ALL.into_iter().filter(at_the_head).map(Colour::name).collect();
+    if !at_the_head.is_empty() {
+        notes.push(format!(
+            "{}: the laser itself is told power_mw, of which fibre, polariser and lenses let less through to the \
+             panel: write into transmission the share that does",
+            at_the_head.join(", ")
         ));
     }
     if rig.panel.orientation != Orientation::Normal {
@@ -582,15 +634,25 @@ impl fmt::Display for LaserMeaning {
             Some(timeout_ms) => writeln!(f, ", or when one hologram has stayed for {timeout_ms} ms")?,
             None => writeln!(f)?,
         }
-        let PerColourFigures { red, green, blue } = self.power_limit_mw;
-        let limits_mw = PerColour([red, green, blue]);
-        let PerColourFigures { red, green, blue } = self.power_mw;
-        let powers = PerColour([red, green, blue]).0.into_iter().zip(limits_mw.0).zip(Colour::ALL);
-        let powers = powers.map(|((power_mw, limit_mw), colour)| match limit_mw {
-            Some(limit_mw) => format!("{colour} {power_mw} mW of at most {limit_mw}"),
-            None => format!("{colour} {power_mw} mW without a power_limit_mw ({} at most)", self.power_max_mw),
+        let [powers_mw, limits_mw, heads_mw] = [self.power_mw, self.power_limit_mw, self.head_power_mw]
+            .map(|PerColourFigures { red, green, blue }| PerColour([red, green, blue]));
+        let powers = Colour::ALL.into_iter().filter_map(|colour| {
+            let power_mw = powers_mw[colour]?;
+            let dark =
+                if self.shown.is_some_and(|shown| shown != colour.name()) { ", not lit in this mode" } else { "" };
+            Some(match limits_mw[colour] {
+                Some(limit_mw) => format!("{colour} {power_mw} mW of at most {limit_mw}{dark}"),
+                None => {
+                    format!("{colour} {power_mw} mW without a power_limit_mw ({} at most){dark}", self.power_max_mw)
+                }
+            })
         });
         writeln!(f, "power          {}", powers.collect::<Vec<_>>().join(", "))?;
+        let heads = Colour::ALL.into_iter().filter_map(|colour| Some(format!("{colour} {} mW", heads_mw[colour]?)));
+        let heads: Vec<_> = heads.collect();
+        if !heads.is_empty() {
+            writeln!(f, "at the laser   {}", heads.join(", "))?;
+        }
         match &self.full_power_mw {
             Some(PerColourFigures { red, green, blue }) => {
                 writeln!(f, "at 100 %       red {red}, green {green}, blue {blue} mW")
@@ -667,14 +729,21 @@ impl fmt::Display for Meaning {
             field.period_ms,
             field.colour_frames_hz
         )?;
-        writeln!(
-            f,
-            "in one field   settled at {:.3} ms, laser on at {:.3}, off at {:.3}: lit for {:.0} % of it",
-            field.settled_ms,
-            field.laser_on_ms,
-            field.laser_off_ms,
-            field.lit_share * 100.0
-        )?;
+        write!(f, "in one field   settled at {:.3} ms", field.settled_ms)?;
+        match (field.laser_on_ms, field.laser_off_ms, field.lit_share, field.time_share) {
+            (Some(on_ms), Some(off_ms), Some(lit_share), Some(time_share)) => writeln!(
+                f,
+                ", laser on at {on_ms:.3}, off at {off_ms:.3}: lit for {:.0} % of it, each colour for {:.0} % of the time",
+                lit_share * 100.0,
+                time_share * 100.0
+            )?,
+            (.., None) => writeln!(f, "; lit as the panel gates the lasers, whatever on_delay_ms and lit_ms say")?,
+            _ => writeln!(
+                f,
+                "; the laser is on while it is armed: lit for 100 % of it, while the phase settles, too, whatever \
+                 on_delay_ms and lit_ms say"
+            )?,
+        }
         write!(f, "{}{}", self.lasers, self.tracker)?;
         if self.pupil_step_mm == 0.0 {
             writeln!(f, "pupil step     none: each hologram is made for the pupil of its own time")?;

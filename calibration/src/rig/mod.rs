@@ -183,16 +183,18 @@ pub struct Lasers {
     /// Greatest optical power that this bench allows each colour, milliwatts at the panel; not less than `power_mw`.
     /// Where the rig says none, [`Lasers::POWER_MAX_MW`] holds.
     pub power_limit_mw: PerColour<Option<f64>>,
-    /// From the field's settled phase to the laser's on edge.
+    /// From the field's settled phase to the laser's on edge; of lasers that are on while armed, to where a field's own
+    /// light is counted from.
     pub on_delay: TimeNs,
-    /// Length of the lit window within a field.
+    /// Length of the lit window within a field, or of what is counted of it.
     pub width: TimeNs,
     /// The box goes dark by itself when it has heard nothing for this long.
     pub heartbeat_timeout: TimeNs,
     /// Lasers go dark when one hologram has stayed on the panel for this long without a newer one; where nothing is
     /// said, after some times the frame time that is measured at the start.
     pub stall_timeout: Option<TimeNs>,
-    /// The panel's own hardware gates each laser to its own field, so that a box that cannot may have all of them on.
+    /// The panel's own hardware gates each laser to its own field, so that a box that cannot may have all of them on; in
+    /// channel-packed mode, whose fields the panel itself knows.
     pub gated_by_panel: bool,
     /// Whoever wrote the rig file knows that these lasers stay lit when holod dies.
     pub accept_no_heartbeat: bool,
@@ -223,6 +225,8 @@ pub enum LaserDriver {
         profile: Box<TextLaserProfile>,
         /// The port of each colour that has a laser.
         paths: PerColour<Option<PathBuf>>,
+        /// The share of a laser's power that gets to the panel, billionths.
+        transmission_ppb: PerColour<u32>,
     },
 }
 
@@ -258,6 +262,22 @@ impl LaserDriver {
         match self {
             Self::Text { paths, .. } => paths.0[colour.index()].is_some(),
             _ => true,
+        }
+    }
+
+    /// Whether its lasers are lit for single fields; others are on while they are armed.
+    pub const fn gates_fields(&self) -> bool {
+        matches!(self, Self::Simulated | Self::Serial { .. })
+    }
+
+    /// The power in microwatts that a laser is told so that `power_uw` of it get to the panel, never more; nothing of
+    /// drivers that are told the power at the panel.
+    pub fn head_power_uw(&self, colour: Colour, power_uw: u32) -> Option<u64> {
+        match self {
+            Self::Text { transmission_ppb, .. } => {
+                Some(u64::from(power_uw) * 1_000_000_000 / u64::from(transmission_ppb[colour].max(1)))
+            }
+            _ => None,
         }
     }
 

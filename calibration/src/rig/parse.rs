@@ -74,6 +74,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
             "profile_file",
             "sync_wire",
             "full_power_mw",
+            "transmission",
             "power_mw",
             "power_limit_mw",
             "on_delay_ms",
@@ -130,6 +131,8 @@ pub const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
 const DEPTH_RANGE_MIN_DPT: f64 = 0.1;
 const POWER: Span = Span::new(0.0, Lasers::POWER_MAX_MW, "mW").slips(POWER_SLIPS);
 const FULL_POWER: Span = Span::new(0.001, 4000.0, "mW").slips(POWER_SLIPS);
+/// A laser may give somewhat more than it is told.
+const TRANSMISSION: Span = Span::new(1e-4, 1.5, "").slips(&[("percent", 1e-2)]);
 /// Lasers are told whole microwatts: less than one is darkness.
 const POWER_LIT_MIN_MW: f64 = 0.001;
 const POWER_SLIPS: &[(&str, f64)] = &[("microwatts", 1e-3)];
@@ -338,7 +341,11 @@ fn read_field_timing<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<Fiel
     let timing = FieldTiming { refresh_hz, mode, field_order, channel_order, frames_per_colour, settle_ms, field_ms };
     if settle_ms.value >= field_ms {
         let expected = format!("less than the {}", timing.describe_field());
-        let advice = "no phase would ever settle: correct the settle time or lower refresh_hz".into();
+        let mut advice = "no phase would ever settle: correct the settle time or lower refresh_hz".to_owned();
+        if mode == PanelMode::FieldSequential {
+            advice += "; a panel that shows its video a frame later, which settle_ms is not for, cannot be lit field by \
+                       field";
+        }
         reader.fault_in(panel, "settle_ms", settle_ms.line, &format!("{} ms", settle_ms.value), &expected, advice);
     }
     Some(timing)
@@ -686,7 +693,14 @@ fn read_lasers<'a>(
     let driver = read_driver(reader, lasers, folder, provenance);
     let gated_by_panel = reader.flag(lasers, "gated_by_panel", false);
     let accept_no_heartbeat = read_acceptance(reader, lasers, driver.as_ref());
-    let power_mw = reader.numbers(lasers, "power_mw", POWER, PerColour([true; 3]));
+    // Of a driver that is faulty these keys alone tell whether it has such lasers.
+    let [may_lack_lasers, may_be_on] = match &driver {
+        Some(driver) => [true, !driver.gates_fields()],
+        None => [lasers.has("devices"), lasers.has("devices") || lasers.has("full_power_mw")],
+    };
+    let is_there = |colour: Colour| driver.as_ref().map_or(!may_lack_lasers, |driver| driver.has(colour));
+    let lasers = if may_be_on { lasers.excusing(&WINDOW_KEYS) } else { lasers };
+    let power_mw = reader.numbers(lasers, "power_mw", POWER, PerColour(Colour::ALL.map(is_there)));
     let power_limit_mw = reader.numbers(lasers, "power_limit_mw", POWER, PerColour([false; 3]));
     for colour in Colour::ALL {
         if let Some(power) = power_mw[colour].as_ref().filter(|power| Lasers::whole_uw(power.value) == 0)
@@ -724,10 +738,19 @@ fn read_lasers<'a>(
         let found = format!("true with panel.field_order = {}", names(timing.field_order));
         reader.fault_in(lasers, "gated_by_panel", line, &found, &expected, advice);
     }
+    check_mode(reader, lasers, timing, driver.as_ref(), gated_by_panel);
+    let left_out = |key: &str| may_be_on && !lasers.has(key);
+    let on_delay_ms = on_delay_ms.or(left_out("on_delay_ms").then_some(Found { value: 0.0, line: None }));
+    let room_ms = |timing: FieldTiming, on_delay_ms: Found<f64>| {
+        timing.field_ms - timing.slack_ms() - timing.settle_ms.value - on_delay_ms.value
+    };
+    // Where no window switches lasers, what is lit of a field begins when its phase has settled.
+    let whole_field = || Some(Found { value: room_ms(timing?, on_delay_ms?).max(LIT.min), line: None });
+    let lit_ms = lit_ms.or_else(|| left_out("lit_ms").then(whole_field).flatten());
     if let (Some(timing), Some(on_delay_ms), Some(lit_ms)) = (timing, on_delay_ms, lit_ms) {
         let before_ms = timing.settle_ms.value + on_delay_ms.value;
         let end_ms = before_ms + lit_ms.value;
-        let room_ms = timing.field_ms - timing.slack_ms() - before_ms;
+        let room_ms = room_ms(timing, on_delay_ms);
         if timing.settle_ms.value < timing.field_ms && (end_ms > timing.field_ms || room_ms < LIT.min) {
             let settle = shown(timing.settle_ms.value);
             let found = format!(
@@ -755,10 +778,15 @@ fn read_lasers<'a>(
             reader.fault_in(lasers, "heartbeat_timeout_ms", heartbeat_ms.line, &found, &expected, advice);
         }
     }
-    let [Some(red), Some(green), Some(blue)] = power_mw.0 else { return None };
+    let driver = driver?;
+    let power_of = |colour: Colour| match power_mw[colour] {
+        Some(power) => Some(power.value),
+        None => (!driver.has(colour)).then_some(0.0),
+    };
+    let power_mw = PerColour([power_of(Colour::Red)?, power_of(Colour::Green)?, power_of(Colour::Blue)?]);
     Some(Lasers {
-        driver: driver?,
-        power_mw: PerColour([red.value, green.value, blue.value]),
+        driver,
+        power_mw,
         power_limit_mw: power_limit_mw.map(|limit| limit.map(|limit| limit.value)),
         on_delay: milliseconds(on_delay_ms?.value),
         width: milliseconds(lit_ms?.value),
@@ -769,12 +797,42 @@ fn read_lasers<'a>(
     })
 }
 
+/// The keys of a window, which switches no laser that is on while it is armed.
+const WINDOW_KEYS: [&str; 2] = ["on_delay_ms", "lit_ms"];
+
+/// Judges what of `[lasers]` goes with some of the panel's modes only.
+fn check_mode<'a>(
+    reader: &Reader<'a>,
+    lasers: Section<'a>,
+    timing: Option<FieldTiming>,
+    driver: Option<&LaserDriver>,
+    gated_by_panel: bool,
+) {
+    let Some(mode) = timing.map(|timing| timing.mode).filter(|&mode| mode != PanelMode::ChannelPacked) else { return };
+    let found = format!("true in {} mode", mode.name());
+    let packed = PanelMode::ChannelPacked.name();
+    if mode == PanelMode::FieldSequential && gated_by_panel {
+        let line = reader.line_of_key(lasers, "gated_by_panel");
+        let expected = format!("false, or mode = \"{packed}\": of a video frame of one colour only holod knows which");
+        let advice = "take it out, and light fields with a laser box (driver = \"serial\"), or show one colour \
+                      (mode = \"monochrome\")";
+        reader.fault_in(lasers, "gated_by_panel", line, &found, &expected, advice.into());
+    }
+    if matches!(driver, Some(LaserDriver::Serial { sync_wire: true, .. })) {
+        let line = reader.line_of_key(lasers, "sync_wire");
+        let expected = format!("mode = \"{packed}\", where the wire's edges begin colour frames");
+        let advice = "take it out: in this mode holod asks for each window by the panel's reports, and nobody looks at \
+                      the wire";
+        reader.fault_in(lasers, "sync_wire", line, &found, &expected, advice.into());
+    }
+}
+
 /// The drivers, each with the keys of `[lasers]` that only some of them have.
 const DRIVERS: [(&str, &[&str]); 4] = [
     ("simulated", &[]),
     ("serial", &["device", "sync_wire"]),
     ("ready-beam", &["device", "full_power_mw", "gated_by_panel", "accept_no_heartbeat"]),
-    ("text", &["devices", "profile", "profile_file", "gated_by_panel", "accept_no_heartbeat"]),
+    ("text", &["devices", "profile", "profile_file", "transmission", "gated_by_panel", "accept_no_heartbeat"]),
 ];
 
 fn read_driver<'a>(
@@ -791,6 +849,7 @@ fn read_driver<'a>(
     let devices = reader.texts(lasers, "devices", PORT);
     let sync_wire = reader.flag(lasers, "sync_wire", false);
     let full_power = reader.numbers(lasers, "full_power_mw", FULL_POWER, PerColour([lasers.has("full_power_mw"); 3]));
+    let transmission = reader.numbers(lasers, "transmission", TRANSMISSION, PerColour([false; 3]));
     let profile = read_text_laser(reader, lasers, folder, provenance);
     let driver = driver?;
     let (name, own) = *driver.value;
@@ -840,9 +899,18 @@ fn read_driver<'a>(
                     reader.fault_in(lasers, &key, path.line, "a port named twice", "one laser to a port", advice);
                 }
             }
+            for colour in Colour::ALL {
+                if let (Some(share), None) = (transmission[colour], devices[colour]) {
+                    let (key, advice) =
+                        (format!("transmission.{colour}"), "name its port in devices, or take this out");
+                    reader.fault_in(lasers, &key, share.line, "that of no laser", "a laser of it", advice.into());
+                }
+            }
             let paths = devices.map(|path| path.map(|path| path.value.into()));
             paths.0.iter().any(Option::is_some).then_some(())?;
-            Some(LaserDriver::Text { profile: Box::new(profile?), paths })
+            let transmission_ppb =
+                transmission.map(|share| share.map_or(1e9, |share| share.value * 1e9).round() as u32);
+            Some(LaserDriver::Text { profile: Box::new(profile?), paths, transmission_ppb })
         }
     }
 }

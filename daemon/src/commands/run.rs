@@ -399,8 +399,11 @@ mod tests {
     fn simulated_lasers_have_the_colours_of_the_rigs_own() {
         let mut lasers = Rig::default().lasers;
         let profile = TextLaserProfile::named("cobolt").unwrap().clone();
-        lasers.driver =
-            LaserDriver::Text { profile: Box::new(profile), paths: PerColour([None, Some("/dev/null".into()), None]) };
+        lasers.driver = LaserDriver::Text {
+            profile: Box::new(profile),
+            paths: PerColour([None, Some("/dev/null".into()), None]),
+            transmission_ppb: PerColour([1_000_000_000; 3]),
+        };
         let green_mw = lasers.power_mw[Colour::Green];
         simulate_lasers(&mut lasers);
         assert_eq!((lasers.driver, lasers.power_mw), (LaserDriver::Simulated, PerColour([0.0, green_mw, 0.0])));

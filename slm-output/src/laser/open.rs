@@ -35,7 +35,7 @@ fn open_once(lasers: &Lasers, clock: fn() -> TimeNs) -> Result<Box<dyn LaserBox>
             Box::new(SerialBox::open(path, serial_options(lasers, *sync_wire), clock)?)
         }
         LaserDriver::ReadyBeam { path, full_power_uw } => ready_beam::open(path, *full_power_uw, lasers, clock)?,
-        LaserDriver::Text { profile, paths } => text_laser::open(profile, paths, lasers, clock)?,
+        LaserDriver::Text { profile, paths, .. } => text_laser::open(profile, paths, lasers, clock)?,
     })
 }
 
@@ -72,7 +72,7 @@ pub fn make_dark(driver: &LaserDriver, clock: fn() -> TimeNs) -> Result<(), Lase
         LaserDriver::Simulated => Ok(()),
         LaserDriver::Serial { path, .. } => SerialBox::make_dark(path, clock),
         LaserDriver::ReadyBeam { path, .. } => ready_beam::make_dark(path, clock),
-        LaserDriver::Text { profile, paths } => {
+        LaserDriver::Text { profile, paths, .. } => {
             let paths: Vec<&Path> = paths.0.iter().flatten().map(PathBuf::as_path).collect();
             all_dark(&paths, |path| text_laser::make_dark(profile, path, clock))
         }

@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{Expected, Lasers, Question, TextLaserProfile};
+use holod_calibration::rig::{Expected, LaserDriver, Lasers, Question, TextLaserProfile};
 use holod_calibration::{Colour, PerColour, TimeNs};
 
 use super::line_link::Sharing;
@@ -24,7 +24,11 @@ struct TextLaser {
 }
 
 /// The lasers of a bench.
-struct TextLasers(PerColour<Option<TextLaser>>);
+struct TextLasers {
+    lasers: PerColour<Option<TextLaser>>,
+    /// What says which power each is told.
+    driver: LaserDriver,
+}
 
 /// Opens the lasers at `paths`. Each is recognised before anything else is said to it, and those that are recognised are
 /// put out even where that fails with another.
@@ -39,14 +43,14 @@ pub(super) fn open(
     clock: fn() -> TimeNs,
 ) -> Result<Box<dyn LaserBox>, LaserError> {
     require_acceptance(lasers)?;
-    let mut open = TextLasers(PerColour([None, None, None]));
+    let mut open = TextLasers { lasers: PerColour([None, None, None]), driver: lasers.driver.clone() };
     let mut recognised = Ok(());
     for colour in Colour::ALL {
         if let Some(path) = &paths[colour] {
             let laser = TextLaser::open(profile, path, Sharing::Alone, clock)
                 .and_then(|mut laser| laser.recognise().map(|()| laser));
             match laser {
-                Ok(laser) => open.0[colour] = Some(laser),
+                Ok(laser) => open.lasers[colour] = Some(laser),
                 Err(why) => recognised = recognised.and(Err(why)),
             }
         }
@@ -55,11 +59,11 @@ pub(super) fn open(
     let put_out = open.set_lit(NONE_LIT);
     recognised.and(put_out)?;
     let prepare = |laser: &mut TextLaser| profile.prepare.iter().try_for_each(|command| laser.command(command));
-    let prepared = open.0.0.iter_mut().flatten().try_for_each(prepare);
+    let prepared = open.lasers.0.iter_mut().flatten().try_for_each(prepare);
     // One that was lit by that, such as by a change of its mode, does not stay lit.
     let put_out = open.set_lit(NONE_LIT);
     prepared.and(put_out)?;
-    open.0.0.iter_mut().flatten().try_for_each(TextLaser::check)?;
+    open.lasers.0.iter_mut().flatten().try_for_each(TextLaser::check)?;
     Ok(Box::new(PowerBox::new(open, lasers, clock)?))
 }
 
@@ -165,14 +169,14 @@ fn text_of(expect: &Expected) -> String {
 
 impl PowerDevice for TextLasers {
     fn has(&self, colour: Colour) -> bool {
-        self.0[colour].is_some()
+        self.lasers[colour].is_some()
     }
 
     fn set_power(&mut self, power_uw: PerColour<u32>) -> Result<(), LaserError> {
         for colour in Colour::ALL {
-            let uw = power_uw[colour];
             // One without power is not switched on, and may have no such power.
-            let Some(laser) = self.0[colour].as_mut().filter(|_| uw > 0) else { continue };
+            let Some(laser) = self.lasers[colour].as_mut().filter(|_| power_uw[colour] > 0) else { continue };
+            let Some(uw) = self.driver.head_power_uw(colour, power_uw[colour]) else { continue };
             let watts = format!("{}.{:06}", uw / 1_000_000, uw % 1_000_000);
             let milliwatts = format!("{}.{:03}", uw / 1000, uw % 1000);
             let command = laser.profile.power.replace("{power_w}", &watts).replace("{power_mw}", &milliwatts);
@@ -182,7 +186,7 @@ impl PowerDevice for TextLasers {
     }
 
     fn switch(&mut self, colour: Colour, on: bool) -> Result<(), LaserError> {
-        match &mut self.0[colour] {
+        match &mut self.lasers[colour] {
             Some(laser) if on => laser.profile.on.clone().iter().try_for_each(|command| laser.command(command)),
             Some(laser) => laser.put_out(),
             None if on => Err(LaserError::NoLaser { colour }),
@@ -193,14 +197,14 @@ impl PowerDevice for TextLasers {
     fn dark_wait(&self) -> TimeNs {
         // The question that goes on, and each laser's commands to go out.
         let wait_ns = |laser: &TextLaser| laser.profile.off.len() as i64 * laser.answer_wait.0;
-        let lasers = || self.0.0.iter().flatten();
+        let lasers = || self.lasers.0.iter().flatten();
         let question_ns = lasers().map(|laser| laser.answer_wait.0 + TRAIL_WAIT.0).max().unwrap_or(0);
         TimeNs(question_ns + lasers().map(wait_ns).sum::<i64>())
     }
 
     fn probe(&mut self, asked: usize) -> Result<bool, LaserError> {
         let mut before = asked;
-        for laser in self.0.0.iter_mut().flatten() {
+        for laser in self.lasers.0.iter_mut().flatten() {
             let TextLaserProfile { healthy, identify, .. } = &laser.profile;
             let questions = if healthy.is_empty() { identify } else { healthy };
             let Some(question) = questions.get(before).cloned() else {
