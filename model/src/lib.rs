@@ -3,7 +3,7 @@
 //! The data's way: [`scene`] loads a frame, [`engine`] runs the pupil-adaptive network of [`weights`] on it and gives a
 //! [`ComplexHologram`], [`optics::DoublePhase`] turns that into a [`PhasePattern`], and [`optics::SimulatedEye`] shows
 //! what an eye sees of it. [`metrics`], [`refocus`] and [`marks`] judge pictures against those of [`scene_shard`], and
-//! [`files`] keeps holograms and pictures on disk. [`scene_renderer`] makes scenes, on the processor or by [`gpu`].
+//! [`files`] keeps holograms and pictures on disk. [`gpu`] is what opens a graphics processor.
 
 pub mod conditions;
 pub mod engine;
@@ -16,9 +16,8 @@ pub mod optics;
 mod phase_math;
 mod picture;
 pub mod refocus;
-mod safetensors_file;
+pub mod safetensors_file;
 pub mod scene;
-pub mod scene_renderer;
 pub mod scene_shard;
 mod simd;
 pub mod weights;

@@ -1,6 +1,6 @@
 //! Bright marks on exact black: how much light is seen of what was put in, and how much where there is none.
 //!
-//! Looked at on the scenes of [`SceneKind::Marks`](crate::scene_renderer::SceneKind::Marks).
+//! Looked at on the scenes of [`SceneKind::Marks`](crate::scene_shard::SceneKind::Marks).
 
 use holod_calibration::Colour;
 

@@ -1,6 +1,6 @@
 //! The refocus test: is a card with fine marks sharper where the eye is focused at it than where it is not?
 //!
-//! Looked at on the scenes of [`SceneKind::Cards`](crate::scene_renderer::SceneKind::Cards), for each card alone.
+//! Looked at on the scenes of [`SceneKind::Cards`](crate::scene_shard::SceneKind::Cards), for each card alone.
 
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Resolution};
 
@@ -78,7 +78,6 @@ impl CardArea {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene_renderer::Scene;
 
     const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
 
@@ -109,22 +108,6 @@ mod tests {
         assert!((area.gradient_energy(&step) - 16.0 * 0.25 / 480.0).abs() < 1e-12);
         let at_the_border = image(|x, y| if x == 1 || y == 18 { 5.0 } else { 0.25 });
         assert_eq!(area.gradient_energy(&at_the_border), 0.0);
-    }
-
-    #[test]
-    fn the_renderers_cards_are_found_and_refocus_as_an_eye_sees_them() {
-        let resolution = Resolution { width: 160, height: 160 };
-        let scene = Scene::cards(true, resolution);
-        let depth = scene.picture().depth;
-        let pixels = scene.focal_stack(holod_calibration::PupilDiameter::from_mm(4.0), &[NEAR_CARD, FAR_CARD], 128);
-        let [near, far] = [0, 1].map(|plane| LinearImage {
-            resolution,
-            pixels: pixels[plane * 3 * resolution.pixels()..][..3 * resolution.pixels()].to_vec(),
-        });
-        let area = |card| CardArea::find(&depth, resolution, card, 8).unwrap();
-        let (near_card, far_card) = (area(NEAR_CARD), area(FAR_CARD));
-        assert!(near_card.gradient_energy(&near) > 4.0 * near_card.gradient_energy(&far));
-        assert!(far_card.gradient_energy(&far) > 4.0 * far_card.gradient_energy(&near));
     }
 
     #[test]

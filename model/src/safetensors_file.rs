@@ -7,24 +7,26 @@ use safetensors::Dtype;
 use serde_json::{Value, json};
 
 /// A tensor on its way into a file.
-pub(crate) struct Tensor<'a> {
+pub struct Tensor<'a> {
     /// Its name.
-    pub(crate) name: String,
+    pub name: String,
     /// What its values are.
-    pub(crate) dtype: Dtype,
+    pub dtype: Dtype,
     /// Its dimensions.
-    pub(crate) shape: Vec<usize>,
+    pub shape: Vec<usize>,
     /// Its values, little endian.
-    pub(crate) bytes: &'a [u8],
+    pub bytes: &'a [u8],
 }
 
 /// Writes `tensors`, wider values first, with `metadata`, all names of the header in order: where a library's map would
 /// bring the metadata in another order each time, the same content is the same bytes.
-pub(crate) fn write(
-    out: &mut dyn Write,
-    mut tensors: Vec<Tensor<'_>>,
-    metadata: &BTreeMap<String, String>,
-) -> io::Result<()> {
+///
+/// # Errors
+/// What `out` says.
+///
+/// # Panics
+/// Where a tensor's bytes are more or fewer than its shape's.
+pub fn write(out: &mut dyn Write, mut tensors: Vec<Tensor<'_>>, metadata: &BTreeMap<String, String>) -> io::Result<()> {
     // So all are aligned to the size of their values.
     tensors.sort_by(|a, b| b.dtype.cmp(&a.dtype).then(a.name.cmp(&b.name)));
     let strings = metadata.iter().map(|(key, value)| (key.as_str(), Value::from(value.as_str())));

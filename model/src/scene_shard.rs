@@ -1,8 +1,13 @@
-//! Reads the scenes with focal stacks that `holod-scenes` writes (format in [`scene_renderer::shard`]).
+//! Shards: scenes with focal stacks that `holod-scenes` writes, one safetensors file for each.
+//!
+//! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0
+//! far, 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are
+//! strings: `format` = "holod-scene-1", `generator` (the scenes that `holod-scenes` draws are the same within one
+//! generation), `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON lists, which other scenes of the folder need
+//! not share), those of the bench on which the scene is seen: `far_dpt`, `near_dpt`, `pixel_angle_rad`,
+//! `wavelengths_nm` (JSON list), `pixel_pitch_um`; `rays`, and `traced_by`: `cpu` or a device's name.
 //!
 //! A shard's header is checked when it is opened; its pixels are read when they are asked for, one stack at a time.
-//!
-//! [`scene_renderer::shard`]: crate::scene_renderer::shard
 
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom};
@@ -13,15 +18,73 @@ use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 use safetensors::Dtype;
 use safetensors::tensor::Metadata;
 
-use crate::scene_renderer::shard::FORMAT;
 use crate::{LinearImage, RgbdFrame};
 
+/// The `format` that a shard's metadata names.
+pub const FORMAT: &str = "holod-scene-1";
 /// Longer headers are refused: a shard's takes some kilobytes.
 const LONGEST_HEADER_BYTES: u64 = 1 << 20;
 /// Relative difference below which two optical figures are the same.
 const OPTICS_TOLERANCE: f64 = 1e-4;
 /// Pupils outside this range are no pupils.
 const PUPILS_MM: std::ops::RangeInclusive<f64> = 0.1..=100.0;
+
+/// What a random scene is for. The kinds never share a scene: each has a seed space of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SceneKind {
+    /// For training.
+    Train,
+    /// For testing: families of textures, and ranges, that no training scene has.
+    Test,
+    /// The refocus test: fine marks on a near and a far card, at 7/8 and 7/80 of the depth range in dioptres, which are
+    /// 2.5 and 0.25 on the default bench; dark on bright where the index is even, bright on dark where it is odd.
+    Cards,
+    /// What black stays: bright marks in the lower half of a picture that is exactly black else, as near and as far as
+    /// the cards. By the index in turn dots of 1 to 3 px, thin lines, many of them diagonal, and stars.
+    Marks,
+}
+
+impl SceneKind {
+    /// The name in files and on the command line.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Test => "test",
+            Self::Cards => "cards",
+            Self::Marks => "marks",
+        }
+    }
+}
+
+/// What [`SceneKind::Marks`] are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Marks {
+    /// Discs, from a pixel to nine.
+    Dots,
+    /// Strokes of 1 to 2 px, 14 px long.
+    Lines,
+    /// Soft points of 2 to 100 % of the light.
+    Stars,
+}
+
+impl Marks {
+    /// Every kind.
+    pub const ALL: [Self; 3] = [Self::Dots, Self::Lines, Self::Stars];
+
+    /// Those of the scene with this number.
+    pub fn of_index(index: u64) -> Self {
+        Self::ALL[(index % 3) as usize]
+    }
+
+    /// Its name in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Dots => "dots",
+            Self::Lines => "lines",
+            Self::Stars => "stars",
+        }
+    }
+}
 
 /// A shard that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -63,6 +126,27 @@ pub enum SceneShardError {
     },
 }
 
+/// The shards of `folder` by name, of which there is one at least.
+///
+/// # Errors
+/// [`SceneShardError::Empty`] where there is none, [`SceneShardError::Read`] where the folder cannot be read.
+pub fn files_of(folder: &Path) -> Result<Vec<PathBuf>, SceneShardError> {
+    let unreadable = |source| SceneShardError::Read { path: folder.to_owned(), source };
+    let mut paths = Vec::new();
+    for entry in fs::read_dir(folder).map_err(unreadable)? {
+        let path = entry.map_err(unreadable)?.path();
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        if name.starts_with("scene_") && name.ends_with(".safetensors") {
+            paths.push(path);
+        }
+    }
+    if paths.is_empty() {
+        return Err(SceneShardError::Empty { folder: folder.to_owned() });
+    }
+    paths.sort();
+    Ok(paths)
+}
+
 /// One scene on disk, its header checked.
 #[derive(Debug)]
 pub struct SceneShard {
@@ -88,21 +172,8 @@ impl SceneShard {
         limit: Option<usize>,
         geometry: &DisplayGeometry,
     ) -> Result<Vec<Self>, SceneShardError> {
-        let unreadable = |source| SceneShardError::Read { path: folder.to_owned(), source };
-        let mut paths = Vec::new();
-        for entry in fs::read_dir(folder).map_err(unreadable)? {
-            let path = entry.map_err(unreadable)?.path();
-            let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-            if name.starts_with("scene_") && name.ends_with(".safetensors") {
-                paths.push(path);
-            }
-        }
-        paths.sort();
-        paths.truncate(limit.unwrap_or(usize::MAX));
-        if paths.is_empty() {
-            return Err(SceneShardError::Empty { folder: folder.to_owned() });
-        }
-        paths.iter().map(|path| Self::open(path, geometry)).collect()
+        let paths = files_of(folder)?;
+        paths.iter().take(limit.unwrap_or(usize::MAX)).map(|path| Self::open(path, geometry)).collect()
     }
 
     /// Opens the shard at `path`, which must have been rendered for `geometry`'s depth range and pixel angle.
@@ -336,27 +407,52 @@ impl Entries<'_> {
 
 #[cfg(test)]
 mod tests {
+    use holod_calibration::write_atomically;
+
     use super::*;
-    use crate::scene_renderer::SceneKind;
-    use crate::scene_renderer::shard::{PlanePlan, PupilPlan, ShardPlan, file_name};
+    use crate::safetensors_file::{self, Tensor};
 
     const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
     const SIZE: Resolution = Resolution { width: 32, height: 24 };
 
-    /// A folder with one small shard of two pupils and two planes.
+    /// A folder with one small shard of two pupils and two planes, whose values are all different.
     fn written() -> (tempfile::TempDir, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
-        let plan = ShardPlan {
-            kind: SceneKind::Test,
-            seed: 3,
-            resolution: SIZE,
-            bench: BENCH,
-            pupils: PupilPlan::Fixed([1.5, 4.0].map(PupilDiameter::from_mm).to_vec()),
-            planes: PlanePlan::Uniform(2),
-            rays: 4,
+        let path = folder.path().join("scene_000005.safetensors");
+        let count = 2 * 3 * SIZE.pixels();
+        let halves = |first: usize, count: usize| -> Vec<u8> {
+            (first..first + count).flat_map(|n| f16::from_f32(n as f32 * 1e-4).to_le_bytes()).collect()
         };
-        plan.write(folder.path(), 5, &crate::scene_renderer::Tracer::cpu()).unwrap();
-        let path = folder.path().join(file_name(5));
+        let stacks = [halves(0, count), halves(count, count)];
+        let image = halves(2 * count, count / 2);
+        let depth: Vec<u8> = (0..SIZE.pixels()).flat_map(|n| (n as f32 * 1e-3).to_le_bytes()).collect();
+        let tensor = |name: &str, dtype, shape: &[usize], bytes| Tensor {
+            name: name.to_owned(),
+            dtype,
+            shape: shape.to_vec(),
+            bytes,
+        };
+        let Resolution { width, height } = SIZE;
+        let tensors = vec![
+            tensor("image", Dtype::F16, &[3, height, width], &image[..]),
+            tensor("depth", Dtype::F32, &[height, width], &depth),
+            tensor("stack_0", Dtype::F16, &[2, 3, height, width], &stacks[0]),
+            tensor("stack_1", Dtype::F16, &[2, 3, height, width], &stacks[1]),
+        ];
+        let focus_dpt = [BENCH.depth_far.0, BENCH.depth_near.0];
+        let metadata = [
+            ("format", FORMAT.to_owned()),
+            ("kind", SceneKind::Test.name().to_owned()),
+            ("seed", "3".to_owned()),
+            ("index", "5".to_owned()),
+            ("pupils_mm", "[1.5, 4.0]".to_owned()),
+            ("focus_dpt", format!("{focus_dpt:?}")),
+            ("far_dpt", BENCH.depth_far.0.to_string()),
+            ("near_dpt", BENCH.depth_near.0.to_string()),
+            ("pixel_angle_rad", BENCH.pixel_angle_rad().to_string()),
+        ];
+        let metadata = metadata.map(|(key, value)| (key.to_owned(), value)).into();
+        write_atomically(&path, |out| safetensors_file::write(out, tensors, &metadata)).unwrap();
         (folder, path)
     }
 
@@ -374,7 +470,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_renderer_wrote_is_read() {
+    fn what_was_written_is_read() {
         let (folder, path) = written();
         let shard = SceneShard::open_folder(folder.path(), None, &BENCH).unwrap().remove(0);
         assert_eq!((shard.path(), shard.resolution(), shard.kind(), shard.index()), (path.as_path(), SIZE, "test", 5));

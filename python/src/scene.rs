@@ -4,7 +4,6 @@ use holod_calibration::Resolution;
 use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::source::scene::{SAMPLE_RESOLUTION, warn_of_oddities};
 use holod_model::scene::{DepthEncoding, Fit, FrameReport, MOST_PIXELS, Scene};
-use holod_model::scene_renderer;
 use numpy::PyArrayMethods;
 use pyo3::prelude::*;
 
@@ -75,7 +74,7 @@ pub(crate) fn render_builtin_scene(
     let height = optional_count(height_px, "height_px")?.unwrap_or(SAMPLE_RESOLUTION.height);
     let size = checked(Resolution { width, height })?;
     let (pixels, depth) = without_lock(py, || {
-        let picture = scene_renderer::sample_scene(size).picture();
+        let picture = holod_scenes::sample_scene(size).picture();
         Ok((interleaved(&picture.image), picture.depth))
     })?;
     Ok((

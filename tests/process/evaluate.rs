@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
-use holod_model::scene_renderer::SceneKind;
-use holod_model::scene_renderer::shard::{PlanePlan, PupilPlan, ShardPlan, file_name};
+use holod_model::scene_shard::SceneKind;
+use holod_scenes::shard::{PlanePlan, PupilPlan, ShardPlan, file_name};
 use holod_tests::daemon::run;
 use serde_json::Value;
 
@@ -235,7 +235,7 @@ fn render_for(bench: DisplayGeometry, folder: &Path, kind: SceneKind, resolution
         rays: 8,
     };
     for index in 0..count {
-        plan.write(folder, index, &holod_model::scene_renderer::Tracer::cpu()).unwrap();
+        plan.write(folder, index, &holod_scenes::Tracer::cpu()).unwrap();
     }
 }
 

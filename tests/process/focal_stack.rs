@@ -7,8 +7,8 @@ use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::engine::{FocalStackEngine, Precision};
 use holod_model::files::StoredHologram;
 use holod_model::scene::{Fit, FocalStack, FocalStackFiles};
-use holod_model::scene_renderer::sample_scene;
 use holod_model::{ComplexHologram, LinearImage, Weights};
+use holod_scenes::sample_scene;
 use holod_tests::daemon::run;
 use serde_json::Value;
 

@@ -42,6 +42,19 @@ pub fn diverged_weights() -> Vec<u8> {
     file
 }
 
+/// Whether tests of shaders run on the machine's graphics card, as `HOLOD_TEST_GPU=hardware` says, and not on Mesa's
+/// software device.
+///
+/// # Panics
+/// Where the variable says something else.
+pub fn on_a_graphics_card() -> bool {
+    match std::env::var("HOLOD_TEST_GPU").as_deref() {
+        Err(_) | Ok("software") => false,
+        Ok("hardware") => true,
+        Ok(other) => panic!("HOLOD_TEST_GPU is `{other}`; expected software or hardware"),
+    }
+}
+
 const MEMORY: &str = "/dev/shm";
 /// More than what the tests that run at one time leave in their folders.
 const MEMORY_BYTES: u64 = 1 << 28;

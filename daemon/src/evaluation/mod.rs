@@ -17,8 +17,7 @@ use holod_model::marks::{self, DarkArea};
 use holod_model::metrics::{self, Part, StackScore};
 use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
 use holod_model::refocus::{self, CardArea, FAR_CARD, NEAR_CARD};
-use holod_model::scene_renderer::{Marks, SceneKind};
-use holod_model::scene_shard::SceneShard;
+use holod_model::scene_shard::{Marks, SceneKind, SceneShard};
 use holod_model::{LinearImage, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 

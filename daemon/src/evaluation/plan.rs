@@ -6,8 +6,7 @@ use std::path::Path;
 use holod_calibration::rig::Rig;
 use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
 use holod_model::metrics::StackScore;
-use holod_model::scene_renderer::{Marks, SceneKind};
-use holod_model::scene_shard::{SceneShard, SceneShardError};
+use holod_model::scene_shard::{Marks, SceneKind, SceneShard, SceneShardError};
 use holod_model::{LinearImage, Weights};
 use serde::Serialize;
 

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use holod_calibration::{DisplayGeometry, Resolution};
+use holod_model::RgbdFrame;
 use holod_model::scene::{ClippedColours, DepthEncoding, FrameReport, Scene, SceneError};
-use holod_model::{RgbdFrame, scene_renderer};
 use serde::{Deserialize, Serialize};
 
 use crate::cli::SceneArgs;
@@ -314,7 +314,7 @@ fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames,
 
 /// The built-in scene as the network reads it.
 pub fn sample_frame(resolution: Resolution) -> RgbdFrame {
-    let picture = scene_renderer::sample_scene(resolution).picture();
+    let picture = holod_scenes::sample_scene(resolution).picture();
     let amplitude = picture.image.into_iter().map(f32::sqrt).collect();
     RgbdFrame { resolution, amplitude, depth_normalised: picture.depth }
 }

@@ -8,15 +8,17 @@ use std::time::Duration;
 use super::{Adapters, GpuChoice, GpuError, MatrixUnits, caught};
 
 /// A device and its queue.
-pub(crate) struct Gpu {
-    pub(crate) device: wgpu::Device,
-    pub(crate) queue: GivenBack<wgpu::Queue>,
+pub struct Gpu {
+    /// What makes encoders; buffers, shaders and bindings are made by [`Gpu`] itself, which finds their faults.
+    pub device: wgpu::Device,
+    /// Where work is submitted.
+    pub queue: GivenBack<wgpu::Queue>,
     name: String,
     fault: Arc<OnceLock<String>>,
     /// The longest that any piece of work may take before the device counts as hung.
     pub(crate) patience: Duration,
     /// The most bytes that a shader can see as one buffer.
-    pub(crate) largest_buffer: u64,
+    pub largest_buffer: u64,
     /// The memory that the threads of a workgroup share, bytes.
     pub(crate) workgroup_bytes: u32,
     /// The most threads of a workgroup, all along x.
@@ -34,12 +36,12 @@ const READ_BYTES: u64 = 64 << 20;
 const PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 900 } else { 120 });
 
 impl Gpu {
-    /// Opens the best device that opens. Its matrix units can be used where that is asked for.
+    /// Opens the best device that opens, without its matrix units.
     ///
     /// # Errors
     /// There is none, or the driver of the best one refuses, and those of all others.
-    pub(crate) fn open(choice: GpuChoice<'_>, with_matrices: bool) -> Result<Self, GpuError> {
-        first_that_opens(&Self::candidates(choice)?, |adapter| Self::on(adapter, with_matrices))
+    pub fn open(choice: GpuChoice<'_>) -> Result<Self, GpuError> {
+        first_that_opens(&Self::candidates(choice)?, |adapter| Self::on(adapter, false))
     }
 
     /// The devices that will do, of which there is one at least, the best first: cards of their own before those that
@@ -83,7 +85,7 @@ impl Gpu {
         Ok(usable)
     }
 
-    /// Opens a device.
+    /// Opens a device. Its matrix units can be used where that is asked for.
     ///
     /// # Errors
     /// Its driver refuses.
@@ -140,7 +142,7 @@ impl Gpu {
     }
 
     /// The device's name, as its driver has it.
-    pub(crate) fn name(&self) -> &str {
+    pub fn name(&self) -> &str {
         &self.name
     }
 
@@ -154,12 +156,10 @@ impl Gpu {
     }
 
     /// A buffer of zeros.
-    pub(crate) fn buffer(
-        &self,
-        what: &'static str,
-        bytes: u64,
-        usage: wgpu::BufferUsages,
-    ) -> Result<wgpu::Buffer, GpuError> {
+    ///
+    /// # Errors
+    /// It is too large, or the device failed.
+    pub fn buffer(&self, what: &'static str, bytes: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer, GpuError> {
         let limit = self.largest_buffer;
         if bytes > limit {
             return Err(GpuError::TooLarge { what, bytes, name: self.name.clone(), limit });
@@ -171,11 +171,10 @@ impl Gpu {
     }
 
     /// A buffer for a shader that holds `values`, or one zero where there are none: an empty one cannot be bound.
-    pub(crate) fn upload<T: bytemuck::NoUninit>(
-        &self,
-        what: &'static str,
-        values: &[T],
-    ) -> Result<wgpu::Buffer, GpuError> {
+    ///
+    /// # Errors
+    /// As [`buffer`](Self::buffer).
+    pub fn upload<T: bytemuck::NoUninit>(&self, what: &'static str, values: &[T]) -> Result<wgpu::Buffer, GpuError> {
         let bytes: &[u8] = bytemuck::cast_slice(values);
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
         let buffer = self.buffer(what, bytes.len().max(size_of::<T>()) as u64, usage)?;
@@ -186,7 +185,10 @@ impl Gpu {
     }
 
     /// A shader's only entry point, with the bindings that it names.
-    pub(crate) fn pipeline(&self, label: &str, wgsl: &str) -> Result<wgpu::ComputePipeline, GpuError> {
+    ///
+    /// # Errors
+    /// The shader is none, or the device failed.
+    pub fn pipeline(&self, label: &str, wgsl: &str) -> Result<wgpu::ComputePipeline, GpuError> {
         let source = wgpu::ShaderSource::Wgsl(wgsl.into());
         let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source });
         self.pipeline_of(label, &module, None)
@@ -233,7 +235,7 @@ impl Gpu {
     }
 
     /// The buffers as a pipeline's bindings 0, 1, …
-    pub(crate) fn bind(&self, pipeline: &wgpu::ComputePipeline, buffers: &[&wgpu::Buffer]) -> wgpu::BindGroup {
+    pub fn bind(&self, pipeline: &wgpu::ComputePipeline, buffers: &[&wgpu::Buffer]) -> wgpu::BindGroup {
         self.bind_at(pipeline, &(0..).zip(buffers.iter().copied()).collect::<Vec<_>>())
     }
 
@@ -252,7 +254,10 @@ impl Gpu {
     }
 
     /// Waits until the work of `submission`, and all before it, is done.
-    pub(crate) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
+    ///
+    /// # Errors
+    /// The device failed, or does not end its work.
+    pub fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
         let until = wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(self.patience) };
         match self.guarded(|| has_ended(self.device.poll(until)))? {
             true => Ok(()),
@@ -269,7 +274,10 @@ impl Gpu {
     }
 
     /// Copies a buffer that was made with `COPY_SRC` to `values`, once all work before is done.
-    pub(crate) fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, values: &mut [T]) -> Result<(), GpuError> {
+    ///
+    /// # Errors
+    /// As [`wait`](Self::wait).
+    pub fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, values: &mut [T]) -> Result<(), GpuError> {
         let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
         let staging = self.buffer("reading back", READ_BYTES.min(size_of_val(values) as u64), usage)?;
         let mut offset = 0;
@@ -308,7 +316,7 @@ fn is_called(info: &wgpu::AdapterInfo, named: &str) -> bool {
 
 /// Something whose end is no panic: that of a queue waits for its device, and wgpu panics where the driver then says
 /// anything but that the device is lost.
-pub(crate) struct GivenBack<T>(Option<T>);
+pub struct GivenBack<T>(Option<T>);
 
 impl<T> Deref for GivenBack<T> {
     type Target = T;
@@ -353,18 +361,16 @@ pub(crate) mod tests {
     use super::*;
     use crate::gpu::panic_is_caught;
 
-    /// What the tests of this crate run on: Mesa's software device, or with `HOLOD_TEST_GPU=hardware` a graphics card.
     pub(crate) fn test_adapters() -> Adapters {
-        match std::env::var("HOLOD_TEST_GPU").as_deref() {
-            Err(_) | Ok("software") => Adapters::Software,
-            Ok("hardware") => Adapters::Hardware,
-            Ok(other) => panic!("HOLOD_TEST_GPU is `{other}`; expected software or hardware"),
-        }
+        if holod_tests::on_a_graphics_card() { Adapters::Hardware } else { Adapters::Software }
     }
 
     pub(crate) fn test_gpu() -> Gpu {
         let adapters = test_adapters();
-        Gpu::open(adapters.into(), true).unwrap_or_else(|error| panic!("{adapters:?} for tests: {error}"))
+        let candidates = Gpu::candidates(adapters.into());
+        candidates
+            .and_then(|candidates| first_that_opens(&candidates, |adapter| Gpu::on(adapter, true)))
+            .unwrap_or_else(|error| panic!("{adapters:?} for tests: {error}"))
     }
 
     #[test]
@@ -379,7 +385,7 @@ pub(crate) mod tests {
 
         let test_gpu = test_gpu();
         let choice = |named| GpuChoice { adapters: test_adapters(), named: Some(named) };
-        let found = Gpu::open(choice(test_gpu.name()), false).expect("by its name");
+        let found = Gpu::open(choice(test_gpu.name())).expect("by its name");
         assert_eq!(found.name(), test_gpu.name());
         let refused = Gpu::candidates(choice("no such card")).expect_err("no such card");
         let text = refused.to_string();

@@ -6,10 +6,12 @@ mod device;
 use std::cell::Cell;
 use std::time::Duration;
 
+#[cfg(feature = "gpu")]
+pub use device::Gpu;
+#[cfg(feature = "gpu")]
+pub(crate) use device::first_that_opens;
 #[cfg(all(test, feature = "gpu"))]
 pub(crate) use device::tests::{test_adapters, test_gpu};
-#[cfg(feature = "gpu")]
-pub(crate) use device::{Gpu, first_that_opens};
 
 /// Which devices will do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,7 +55,7 @@ pub(crate) enum MatrixUnits {
 /// There is none that can be opened.
 pub fn find(adapters: Adapters) -> Result<String, GpuError> {
     #[cfg(feature = "gpu")]
-    return Gpu::open(adapters.into(), false).map(|gpu| gpu.name().to_owned());
+    return Gpu::open(adapters.into()).map(|gpu| gpu.name().to_owned());
     #[cfg(not(feature = "gpu"))]
     {
         let _ = adapters;

@@ -1,6 +1,7 @@
 //! Procedural meshes: solids of revolution and prisms, tori, and lumps with bumps, turned at random and shaded.
 
-use super::SceneKind;
+use holod_model::scene_shard::SceneKind;
+
 use super::families::pattern;
 use super::random::Random;
 use super::surface::{Bounds, Mesh, Surface, Vertex};

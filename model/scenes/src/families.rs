@@ -1,6 +1,7 @@
 //! Which families of patterns scenes for training and for testing draw from.
 
-use super::SceneKind;
+use holod_model::scene_shard::SceneKind;
+
 use super::random::Random;
 use super::texture::{Pattern, Rgb, Wave};
 

@@ -3,14 +3,14 @@
 use std::convert::Infallible;
 
 use holod_calibration::{Dioptres, PupilDiameter};
+use holod_model::gpu::GpuError;
+#[cfg(feature = "gpu")]
+use holod_model::gpu::{Adapters, Gpu};
 
 use super::Scene;
 #[cfg(feature = "gpu")]
 use super::gpu::{GpuAdder, GpuTracer};
 use super::thin_lens::{CpuAdder, Lens, focal_stacks};
-use crate::gpu::GpuError;
-#[cfg(feature = "gpu")]
-use crate::gpu::{Adapters, Gpu};
 
 /// Where rays are traced: the same rays, so that images agree to rounding.
 pub struct Tracer(Kind);
@@ -33,7 +33,7 @@ impl Tracer {
     /// There is none, its driver refuses, or this program was built without the feature `gpu`.
     pub fn gpu() -> Result<Self, GpuError> {
         #[cfg(feature = "gpu")]
-        return Self::on(Gpu::open(Adapters::Hardware.into(), false)?);
+        return Self::on(Gpu::open(Adapters::Hardware.into())?);
         #[cfg(not(feature = "gpu"))]
         Err(GpuError::NotBuilt)
     }
@@ -44,7 +44,7 @@ impl Tracer {
     /// As [`Tracer::gpu`].
     pub fn software_gpu() -> Result<Self, GpuError> {
         #[cfg(feature = "gpu")]
-        return Self::on(Gpu::open(Adapters::Software.into(), false)?);
+        return Self::on(Gpu::open(Adapters::Software.into())?);
         #[cfg(not(feature = "gpu"))]
         Err(GpuError::NotBuilt)
     }

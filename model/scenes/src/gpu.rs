@@ -7,12 +7,12 @@
 use bytemuck::{Pod, Zeroable};
 use half::f16;
 use holod_calibration::Resolution;
+use holod_model::gpu::{Gpu, GpuError};
 use wgpu::BufferUsages;
 
 use super::points::ViewPoint;
 use super::surface::{Mesh, Shape, Surface};
 use super::thin_lens::{Adder, Lens};
-use crate::gpu::{Gpu, GpuError};
 
 /// Invocations of a workgroup along x and y, as the shaders have it.
 const WORKGROUP: [u32; 2] = [16, 8];

@@ -1,10 +1,10 @@
 //! Random scenes, drawn from a seed: what the network learns from and is tested on.
 
 use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
+use holod_model::scene_shard::{Marks, SceneKind};
 
-use super::SceneKind;
 use super::families::{bright_and_dark, colour, marks, pattern};
-use super::random::{Random, hash_unit, mix};
+use super::random::{Random, hash_unit, mix, stream};
 use super::stage::{Reach, Stage};
 use super::surface::{Bounds, Paint, Shape, Surface};
 use super::texture::{Pattern, blend};
@@ -20,7 +20,7 @@ pub(super) fn random_surfaces(
     resolution: Resolution,
     widest: PupilDiameter,
 ) -> Vec<Surface> {
-    let mut random = Random::new(mix(seed) ^ kind.stream(), index);
+    let mut random = Random::new(mix(seed) ^ stream(kind), index);
     let area = resolution.pixels() as f32 / (256.0 * 256.0);
     let stage = Stage {
         half_width: 0.5 * resolution.width as f32,
@@ -489,36 +489,6 @@ pub(super) fn refocus_cards(
         }));
     }
     surfaces
-}
-
-/// What [`SceneKind::Marks`] are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Marks {
-    /// Discs, from a pixel to nine.
-    Dots,
-    /// Strokes of 1 to 2 px, 14 px long.
-    Lines,
-    /// Soft points of 2 to 100 % of the light.
-    Stars,
-}
-
-impl Marks {
-    /// Every kind.
-    pub const ALL: [Self; 3] = [Self::Dots, Self::Lines, Self::Stars];
-
-    /// Those of the scene with this number.
-    pub fn of_index(index: u64) -> Self {
-        Self::ALL[(index % 3) as usize]
-    }
-
-    /// Its name in tables.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Dots => "dots",
-            Self::Lines => "lines",
-            Self::Stars => "stars",
-        }
-    }
 }
 
 /// Bright marks, which `random` draws, in the lower half of a black picture: on the left they stand at 2.5 dioptres, on

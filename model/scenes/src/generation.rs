@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
-use super::SceneKind;
-use super::random::{Random, mix};
+use holod_model::scene_shard::SceneKind;
+
+use super::random::{Random, mix, stream};
 
 /// Cards and marks of the shipped networks' recipe, `model/weights/README.md`: kind, seed and indices. They stay as they
 /// were when these networks learnt from them and were judged on them.
@@ -36,11 +37,11 @@ pub(super) fn drawn(kind: SceneKind, seed: u64, index: u64) -> Random {
     let of_recipe = is_of_recipe(kind, seed, index);
     match kind {
         SceneKind::Cards if of_recipe => {
-            Random::new(mix(seed ^ (index / 2)) ^ kind.stream(), u64::from(index.is_multiple_of(2)))
+            Random::new(mix(seed ^ (index / 2)) ^ stream(kind), u64::from(index.is_multiple_of(2)))
         }
-        SceneKind::Marks if of_recipe => Random::new(mix(seed ^ (index / 3)) ^ kind.stream(), index % 3),
+        SceneKind::Marks if of_recipe => Random::new(mix(seed ^ (index / 3)) ^ stream(kind), index % 3),
         // Mixed twice: once is another seed's of the recipe.
-        SceneKind::Cards | SceneKind::Marks => Random::new(mix(mix(seed)) ^ kind.stream(), index),
+        SceneKind::Cards | SceneKind::Marks => Random::new(mix(mix(seed)) ^ stream(kind), index),
         SceneKind::Train | SceneKind::Test => unreachable!("they are drawn as a whole"),
     }
 }

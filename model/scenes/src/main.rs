@@ -1,6 +1,5 @@
 //! Writes random scenes with their thin-lens focal stacks, for training and judging a network.
 
-use std::fs;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -12,12 +11,10 @@ use holod_calibration::rig::{Rig, RigError};
 use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution, Sorted, hangup_is_ignored, write_atomically};
 use holod_model::gpu::GpuError;
 use holod_model::scene::FocalStack;
-use holod_model::scene_renderer::shard::{
-    Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan, stop_writing,
-};
-use holod_model::scene_renderer::{SceneKind, Tracer};
-use holod_model::scene_shard::{SceneShard, SceneShardError};
+use holod_model::scene_shard::{self, SceneKind, SceneShard, SceneShardError};
 use holod_model::srgb8;
+use holod_scenes::Tracer;
+use holod_scenes::shard::{Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan, stop_writing};
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
@@ -264,6 +261,16 @@ impl From<ShardError> for Failure {
     }
 }
 
+impl From<SceneShardError> for Failure {
+    fn from(error: SceneShardError) -> Self {
+        let code = match error {
+            SceneShardError::Read { .. } | SceneShardError::Empty { .. } => exit::NO_INPUT,
+            SceneShardError::Damaged { .. } | SceneShardError::Content { .. } => exit::DATA,
+        };
+        Self { code, message: error.to_string() }
+    }
+}
+
 impl From<RigError> for Failure {
     fn from(error: RigError) -> Self {
         Self { code: exit::CONFIG, message: error.to_string() }
@@ -350,11 +357,7 @@ fn take_away_on_signals() {
 
 fn focal_stack(options: &FocalStackOf) -> Result<String, Failure> {
     let bench = bench_of(options.rig.as_deref())?;
-    let unreadable = |error: SceneShardError| {
-        let is_absent = matches!(error, SceneShardError::Read { .. });
-        Failure { code: if is_absent { exit::NO_INPUT } else { exit::DATA }, message: error.to_string() }
-    };
-    let shard = SceneShard::open(&options.scene, &bench).map_err(unreadable)?;
+    let shard = SceneShard::open(&options.scene, &bench)?;
     let wanted = |pupil: &PupilDiameter| (pupil.mm() - options.pupil).abs() < 1e-4;
     let index = shard.pupils().iter().position(wanted).ok_or_else(|| {
         let there: Vec<String> = shard.pupils().iter().map(|pupil| pupil.mm().to_string()).collect();
@@ -366,7 +369,7 @@ fn focal_stack(options: &FocalStackOf) -> Result<String, Failure> {
         );
         Failure { code: exit::USAGE, message }
     })?;
-    let images = shard.stack(index).map_err(unreadable)?;
+    let images = shard.stack(index)?;
     FocalStack::save(&options.out, &images, shard.focuses(), shard.pupils()[index]).map_err(|error| Failure {
         code: exit::CANNOT_CREATE,
         message: match error.kind() {
@@ -468,28 +471,9 @@ fn sheet(options: &Sheet) -> Result<String, Failure> {
             format!("--out: found {}; name another file, or overwrite it with --force", options.out.display());
         return Err(Failure { code: exit::CANNOT_CREATE, message });
     }
-    let unreadable = |error: std::io::Error| Failure {
-        code: exit::NO_INPUT,
-        message: format!("cannot read the folder {}: {error}", options.folder.display()),
-    };
-    let mut files = Vec::new();
-    for entry in fs::read_dir(&options.folder).map_err(unreadable)? {
-        let path = entry.map_err(unreadable)?.path();
-        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        if name.starts_with("scene_") && name.ends_with(".safetensors") {
-            files.push(path);
-        }
-    }
-    files.sort();
-    files.truncate(usize::from(options.scenes));
-    if files.is_empty() {
-        let message = format!(
-            "{} holds no scene_*.safetensors; write some with `holod-scenes generate`",
-            options.folder.display()
-        );
-        return Err(Failure { code: exit::NO_INPUT, message });
-    }
-    let previews = files.iter().map(|path| Preview::read(path)).collect::<Result<Vec<_>, _>>()?;
+    let files = scene_shard::files_of(&options.folder)?;
+    let shown = files.iter().take(usize::from(options.scenes));
+    let previews = shown.map(|path| Preview::read(path)).collect::<Result<Vec<_>, _>>()?;
     let picture = contact_sheet(&previews);
     save_png(&picture, &options.out)?;
     Ok(format!(

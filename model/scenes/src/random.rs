@@ -1,5 +1,6 @@
 //! Reproducible random numbers: one PCG stream for each purpose, and a hash for textures.
 
+use holod_model::scene_shard::SceneKind;
 use rand::Rng;
 use rand_pcg::Pcg32;
 
@@ -36,6 +37,16 @@ impl Random {
 
     pub(super) fn seed(&mut self) -> u32 {
         self.0.next_u32()
+    }
+}
+
+/// Scenes of one kind are drawn from a seed space of their own.
+pub(super) fn stream(kind: SceneKind) -> u64 {
+    match kind {
+        SceneKind::Train => 0x7472_6169_6e00,
+        SceneKind::Test => 0x7465_7374_0000,
+        SceneKind::Cards => 0x6361_7264_7300,
+        SceneKind::Marks => 0x6d61_726b_7300,
     }
 }
 

@@ -2,7 +2,9 @@
 //!
 //! A [`Scene`] is a set of textured surfaces between infinity and the near end of the depth range. Its
 //! [`picture`](Scene::picture) is what a pinhole sees; its [`focal_stack`](Scene::focal_stack) is what an eye with a
-//! round pupil sees at each focus. Light is linear throughout. [`shard`] writes scenes as files for the trainer.
+//! round pupil sees at each focus. Light is linear throughout. [`shard`] writes scenes as files, for the
+//! trainer and for `holod evaluate`; so does the program `holod-scenes`, on the processor or on a graphics processor.
+//! The daemon shows [`sample_scene`].
 
 mod compose;
 mod demo;
@@ -29,51 +31,14 @@ mod tracer;
 mod view;
 
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
+use holod_model::gpu::GpuError;
+use holod_model::scene_shard::{Marks, SceneKind};
 
-pub use compose::Marks;
 pub use generation::generator;
 pub use noise::Noise;
 use surface::Surface;
 use thin_lens::PixelSamples;
 pub use tracer::Tracer;
-
-use crate::gpu::GpuError;
-
-/// What a random scene is for. The kinds never share a scene: each has a seed space of its own.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum SceneKind {
-    /// For training.
-    Train,
-    /// For testing: families of textures, and ranges, that no training scene has.
-    Test,
-    /// The refocus test: fine marks on a near and a far card, at 7/8 and 7/80 of the depth range in dioptres, which are
-    /// 2.5 and 0.25 on the default bench; dark on bright where the index is even, bright on dark where it is odd.
-    Cards,
-    /// What black stays: bright marks in the lower half of a picture that is exactly black else, as near and as far as
-    /// the cards. By the index in turn dots of 1 to 3 px, thin lines, many of them diagonal, and stars.
-    Marks,
-}
-
-impl SceneKind {
-    /// The name in files and on the command line.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Train => "train",
-            Self::Test => "test",
-            Self::Cards => "cards",
-            Self::Marks => "marks",
-        }
-    }
-
-    fn stream(self) -> u64 {
-        match self {
-            Self::Train => 0x7472_6169_6e00,
-            Self::Test => 0x7465_7374_0000,
-            Self::Cards => 0x6361_7264_7300,
-            Self::Marks => 0x6d61_726b_7300,
-        }
-    }
-}
 
 /// A pinhole picture with its depth.
 #[derive(Clone, Debug, PartialEq)]
@@ -119,14 +84,14 @@ impl Scene {
             }
             SceneKind::Marks => {
                 let drawn = generation::drawn(kind, seed, index);
-                let marks = compose::bright_marks(compose::Marks::of_index(index), drawn, resolution, widest);
+                let marks = compose::bright_marks(Marks::of_index(index), drawn, resolution, widest);
                 (marks, PixelSamples::Grid)
             }
             SceneKind::Train | SceneKind::Test => {
                 (compose::random_surfaces(kind, seed, index, resolution, widest), PixelSamples::Lattice)
             }
         };
-        let ray_key = random::mix(random::mix(seed) ^ kind.stream() ^ index);
+        let ray_key = random::mix(random::mix(seed) ^ random::stream(kind) ^ index);
         Self { surfaces, resolution, ray_key, pixel_samples }
     }
 

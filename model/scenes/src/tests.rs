@@ -1,6 +1,9 @@
 use std::collections::HashSet;
 
 use holod_calibration::{Metres, PerColour};
+use holod_model::LinearImage;
+use holod_model::refocus::{CardArea, FAR_CARD, NEAR_CARD};
+use holod_model::scene_shard::SceneShard;
 use proptest::prelude::*;
 
 use super::families::Family;
@@ -660,8 +663,14 @@ fn a_folder_that_cannot_be_made_is_named() {
 /// On the device that tests run on.
 #[cfg(feature = "gpu")]
 mod on_a_gpu {
+    use holod_model::gpu::{Adapters, Gpu, GpuError};
+
     use super::*;
-    use crate::gpu::{Gpu, GpuError, test_gpu};
+
+    fn test_gpu() -> Gpu {
+        let adapters = if holod_tests::on_a_graphics_card() { Adapters::Hardware } else { Adapters::Software };
+        Gpu::open(adapters.into()).unwrap_or_else(|error| panic!("{adapters:?} for tests: {error}"))
+    }
 
     /// Mean squared difference in dB below the peak of 1, and the share of values more than 0.02 apart.
     fn apart(a: &[f32], b: &[f32]) -> (f64, f64) {
@@ -793,4 +802,45 @@ fn marks_are_bright_near_and_far_and_all_else_is_exactly_black() {
             assert!((seen / sharp - 1.0).abs() < 0.05, "blur keeps the light: {seen} of {sharp} in plane {plane}");
         }
     }
+}
+
+#[test]
+fn what_was_written_is_read_as_a_shard() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let plan = ShardPlan { kind: SceneKind::Test, ..small_plan() };
+    plan.write(folder.path(), 5, &Tracer::cpu()).expect("a shard");
+    let shard = SceneShard::open_folder(folder.path(), None, &plan.bench).expect("the folder").remove(0);
+    assert_eq!((shard.kind(), shard.seed(), shard.index()), ("test", plan.seed, 5));
+    assert_eq!(shard.resolution(), plan.resolution);
+    assert_eq!((shard.pupils(), shard.focuses()), (&plan.pupils(5)[..], &plan.focus(5)[..]));
+
+    let PlannedScene { scene, pupils, focus } = plan.scene(5);
+    let near = |found: &[f32], expected: &[f32]| {
+        found.len() == expected.len() && found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-3)
+    };
+    let (frame, picture) = (shard.frame().expect("a frame"), scene.picture());
+    let light: Vec<f32> = frame.amplitude.iter().map(|amplitude| amplitude * amplitude).collect();
+    assert!(near(&light, &picture.image) && frame.depth_normalised == picture.depth);
+    let stacks = scene.focal_stacks(&pupils, &focus, plan.rays);
+    for (pupil, stack) in stacks.iter().enumerate() {
+        let planes = shard.stack(pupil).expect("a stack");
+        assert!(near(&planes.into_iter().flat_map(|plane| plane.pixels).collect::<Vec<_>>(), stack), "{pupil}");
+    }
+    assert!(stacks.len() > 1 && !near(&stacks[0], &stacks[1]), "the comparison is blind");
+}
+
+#[test]
+fn cards_are_found_and_refocus_as_an_eye_sees_them() {
+    let resolution = Resolution { width: 160, height: 160 };
+    let scene = Scene::cards(true, resolution);
+    let depth = scene.picture().depth;
+    let pixels = scene.focal_stack(mm(4.0), &[NEAR_CARD, FAR_CARD], 128);
+    let [near, far] = [0, 1].map(|plane| LinearImage {
+        resolution,
+        pixels: pixels[plane * 3 * resolution.pixels()..][..3 * resolution.pixels()].to_vec(),
+    });
+    let area = |card| CardArea::find(&depth, resolution, card, 8).expect("a card");
+    let (near_card, far_card) = (area(NEAR_CARD), area(FAR_CARD));
+    assert!(near_card.gradient_energy(&near) > 4.0 * near_card.gradient_energy(&far));
+    assert!(far_card.gradient_energy(&far) > 4.0 * far_card.gradient_energy(&near));
 }

@@ -1,12 +1,5 @@
-//! Shards: one safetensors file for each scene, with its picture, depth and focal stacks.
-//!
-//! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0
-//! far,
-//! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are
-//! strings: `format` = "holod-scene-1", `generator` (see [`generator`]), `kind`, `seed`, `index`, `pupils_mm` and
-//! `focus_dpt` (JSON lists, which other scenes of the folder need not share), those of the bench on which the scene is
-//! seen: `far_dpt`, `near_dpt`, `pixel_angle_rad`, `wavelengths_nm` (JSON list), `pixel_pitch_um`; `rays`, and
-//! `traced_by`: `cpu` or a device's name.
+//! Writes shards, one file for each scene with its picture, depth and focal stacks (format in
+//! [`holod_model::scene_shard`]).
 //!
 //! While a shard is made, memory holds its stacks as F16 and, once, the F32 sums of one: at 1920x1080 12 MB and 25 MB a
 //! plane. It is written from there, and read for a sheet, without a copy of the whole.
@@ -21,15 +14,14 @@ use std::sync::{Mutex, PoisonError};
 
 use half::f16;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution, write_atomically};
+use holod_model::gpu::GpuError;
+use holod_model::safetensors_file::{self, Tensor};
+use holod_model::scene_shard::{FORMAT, SceneKind};
 use safetensors::tensor::{Dtype, Metadata};
 
-use super::random::{Random, mix};
-use super::{Scene, SceneKind, Tracer, generator};
-use crate::gpu::GpuError;
-use crate::safetensors_file::{self, Tensor};
+use super::random::{Random, mix, stream};
+use super::{Scene, Tracer, generator};
 
-/// The `format` that a shard's metadata names.
-pub const FORMAT: &str = "holod-scene-1";
 /// Blur over the depth volume, in panel pixels, that scenes are made for: less is hardly any, and more would be as
 /// large as the objects.
 pub const BLUR_RANGE_PX: (f64, f64) = (5.0, 250.0);
@@ -56,7 +48,7 @@ impl PupilPlan {
     /// The pupils of one scene on a bench.
     pub fn pupils(&self, bench: &DisplayGeometry, kind: SceneKind, seed: u64, index: u64) -> Vec<PupilDiameter> {
         let in_strata = |parts: usize, mm_at: &dyn Fn(f32) -> f32| {
-            let mut random = Random::new(mix(seed ^ 0x7075_7069_6c73) ^ kind.stream(), index);
+            let mut random = Random::new(mix(seed ^ 0x7075_7069_6c73) ^ stream(kind), index);
             (0..parts).map(|part| PupilDiameter::from_mm(mm_at((part as f32 + random.unit()) / parts as f32))).collect()
         };
         match self {
@@ -167,7 +159,7 @@ impl PlanePlan {
 
     /// The planes of one scene, far to near.
     pub fn focus(self, bench: &DisplayGeometry, kind: SceneKind, seed: u64, index: u64) -> Vec<Dioptres> {
-        let mut random = Random::new(mix(seed ^ 0x706c_616e_6573) ^ kind.stream(), index);
+        let mut random = Random::new(mix(seed ^ 0x706c_616e_6573) ^ stream(kind), index);
         let mut position = |plane: usize| match self {
             Self::Uniform(count) => plane as f64 / (count - 1) as f64,
             Self::Strata(parts) => (plane as f64 + f64::from(random.unit())) / parts as f64,

@@ -36,6 +36,9 @@ fn a_sheet_is_a_png_and_overwrites_by_force_only() {
     let generate = ["generate", "--out", "scenes", "--seed", "1", "--count", "1", "--size", "32", "--rays", "1"];
     assert!(run(HOLOD_SCENES, &generate, folder.path()).status.success());
     let sheet = |more: &[&str]| run(HOLOD_SCENES, &[&["sheet", "scenes", "--out"], more].concat(), folder.path());
+    let nothing = run(HOLOD_SCENES, &["sheet", ".", "--out", "sheet.png"], folder.path());
+    assert_eq!(nothing.status.code(), Some(66), "{nothing:?}");
+    assert!(nothing.stderr.contains("scene_*.safetensors"), "{nothing:?}");
     let jpeg = sheet(&["sheet.jpg"]);
     assert_eq!(jpeg.status.code(), Some(64), "{jpeg:?}");
     assert!(jpeg.stderr.contains("sheet.jpg") && jpeg.stderr.contains("FILE.png"), "{jpeg:?}");

@@ -1,6 +1,6 @@
 //! Where a random scene is laid out: the picture's extent, and how far surfaces must reach beyond it.
 
-use super::SceneKind;
+use holod_model::scene_shard::SceneKind;
 
 /// Room for the outermost rays of the widest pupil for which a scene is laid out.
 #[derive(Clone, Copy)]
