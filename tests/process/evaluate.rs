@@ -219,7 +219,7 @@ fn an_evaluation_says_what_computed_it_and_of_which_scenes() {
 }
 
 /// Renders `count` scenes of `kind` into `folder`.
-fn render(folder: &Path, kind: SceneKind, resolution: Resolution, count: u64) {
+pub(crate) fn render(folder: &Path, kind: SceneKind, resolution: Resolution, count: u64) {
     render_for(DisplayGeometry::DEFAULT, folder, kind, resolution, count);
 }
 

@@ -3,10 +3,13 @@
 use std::path::Path;
 use std::time::Duration;
 
+use holod_calibration::Resolution;
+use holod_model::scene_shard::SceneKind;
 use holod_tests::daemon::{Daemon, Ended, run};
 use serde_json::Value;
 
 use crate::HOLOD;
+use crate::evaluate::render;
 
 const RENDER: [&str; 8] = ["render", "--weights", "small", "--resolution", "48x32", "--pupil", "3", "--force"];
 
@@ -66,6 +69,41 @@ fn a_gpu_gives_the_processors_hologram_and_is_named() {
     let wider: Vec<&str> = wider.iter().map(|&arg| if arg == "5" { "--pupil=5" } else { arg }).collect();
     assert!(run(HOLOD, &wider, folder.path()).status.success());
     assert!(share_apart(folder.path(), "gpu", "wider") > 1e-2, "the comparison is blind");
+}
+
+/// Figures of quality in which two evaluations are more than 0.05 dB apart.
+fn figures_apart(one: &Value, other: &Value) -> Vec<String> {
+    let [ours, theirs] = [one, other].map(|evaluation| evaluation["rows"].as_array().unwrap());
+    assert_eq!((ours.len(), theirs.len()), (2, 2), "a row for each pupil");
+    let mut apart = Vec::new();
+    for (ours, theirs) in ours.iter().zip(theirs) {
+        assert_eq!(ours["pupil_mm"], theirs["pupil_mm"]);
+        for figure in ["psnr_db", "psnr_in_focus_db", "psnr_out_of_focus_db", "flat_oracle_psnr_db"] {
+            let [ours_db, theirs_db] = [ours, theirs].map(|row| row[figure]["mean"].as_f64().unwrap());
+            if (ours_db - theirs_db).abs() > 0.05 {
+                apart.push(format!("{figure} at {} mm: {ours_db} for {theirs_db}", ours["pupil_mm"]));
+            }
+        }
+    }
+    apart
+}
+
+#[test]
+fn weights_are_judged_alike_by_a_gpu_and_the_processor() {
+    let folder = holod_tests::new_folder();
+    render(&folder.path().join("scenes"), SceneKind::Test, Resolution { width: 64, height: 64 }, 1);
+    let evaluated = |weights: &str, backend: &str| -> Value {
+        let args = ["evaluate", "--scenes", "scenes", "--border-px", "8", "--json", "--weights", weights];
+        let ended = run(HOLOD, &[&args[..], &["--backend", backend]].concat(), folder.path());
+        assert!(ended.status.success(), "{ended:?}");
+        serde_json::from_str(&ended.stdout).unwrap()
+    };
+    let [gpu, cpu, other] = [("fast", "gpu"), ("fast", "cpu"), ("small", "cpu")].map(|(w, b)| evaluated(w, b));
+    let engines = [&gpu, &cpu].map(|evaluation| evaluation["engine"].as_str().unwrap());
+    assert!(engines[0].starts_with("gpu, ") && engines[1].starts_with("cpu, "), "{engines:?}");
+    assert_eq!(figures_apart(&gpu, &cpu), Vec::<String>::new());
+    let apart = figures_apart(&gpu, &other);
+    assert!(apart.iter().any(|figure| figure.starts_with("psnr_db")), "the comparison is blind: {apart:?}");
 }
 
 #[test]
