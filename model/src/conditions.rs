@@ -15,6 +15,12 @@ use std::fmt;
 use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
 use serde::{Deserialize, Serialize};
 
+/// The widest pupil that engines take. No eye's is half as wide; but scenes of wider ones on one bench stand for those
+/// of eyes on another, whose pixels are finer.
+pub const WIDEST_PUPIL: PupilDiameter = PupilDiameter::from_mm(20.0);
+/// Focuses no farther apart are one.
+pub(crate) const SAME_FOCUS_DPT: f64 = 1e-3;
+
 const REFERENCE_BLUR_PX: f64 = 40.0;
 const REFERENCE_FRESNEL_PX2: f64 = 40.0;
 /// By which factor a bench's diffraction may lie outside what was trained before it is no longer run.

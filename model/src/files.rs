@@ -15,7 +15,7 @@ use num_complex::Complex32;
 use safetensors::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};
 
-use crate::engine::WIDEST_PUPIL;
+use crate::conditions::WIDEST_PUPIL;
 use crate::picture::srgb8;
 use crate::safetensors_file::{self, Tensor};
 use crate::{ComplexHologram, LinearImage, PhasePattern};

@@ -4,7 +4,7 @@ use std::f64::consts::{PI, SQRT_2};
 
 use holod_calibration::DisplayGeometry;
 
-use super::WIDEST_PUPIL;
+use crate::conditions::WIDEST_PUPIL;
 
 /// Entries of the table to a unit of its argument: linear interpolation is then within 5e-7.
 const DENSITY: f64 = 256.0;

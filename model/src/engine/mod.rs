@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use holod_calibration::{PupilDiameter, Resolution};
 
+use crate::conditions::WIDEST_PUPIL;
 use crate::gpu::GpuError;
 use crate::weights::Architecture;
 
@@ -23,10 +24,6 @@ pub use cpu::{CpuEngine, FocalStackEngine, fma_peak, stream_bandwidth};
 pub use gpu::cost as gpu_cost;
 #[cfg(feature = "gpu")]
 pub use gpu::{EncodedCounts, GpuEngine};
-
-/// The widest pupil that engines take. No eye's is half as wide; but scenes of wider ones on one bench stand for those
-/// of eyes on another, whose pixels are finer.
-pub const WIDEST_PUPIL: PupilDiameter = PupilDiameter::from_mm(20.0);
 
 /// What the layers of a network multiply, which is most of what is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,9 +34,6 @@ pub enum Precision {
     /// stored as well; on a processor bfloat16s. Where the device has none, single precision takes its place.
     Half,
 }
-
-/// Focuses no farther apart are one.
-pub(crate) const SAME_FOCUS_DPT: f64 = 1e-3;
 
 /// A frame that an engine refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -22,7 +22,7 @@ use super::description::{line_error, read_text};
 use super::fit::Placement;
 use super::{ClippedColours, Fit, SceneError, raster};
 use crate::LinearImage;
-use crate::engine::{SAME_FOCUS_DPT, WIDEST_PUPIL};
+use crate::conditions::{SAME_FOCUS_DPT, WIDEST_PUPIL};
 use crate::weights::MOST_DEPTH_LAYERS;
 
 const FILE: &str = "stack.toml";

@@ -34,7 +34,8 @@ mod workers;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 
 use self::network::Network;
-use crate::engine::{EngineError, Precision, SAME_FOCUS_DPT, StageTimings, check_pupil};
+use crate::conditions::SAME_FOCUS_DPT;
+use crate::engine::{EngineError, Precision, StageTimings, check_pupil};
 use crate::scene::FocalStack;
 use crate::simd::{InstructionSet, Products};
 use crate::weights::{Architecture, NetworkConfig};

@@ -8,7 +8,7 @@ use super::feature_map::FeatureMap;
 use super::network::Network;
 use super::stage::{Job, Seen};
 use super::*;
-use crate::engine::WIDEST_PUPIL;
+use crate::conditions::WIDEST_PUPIL;
 use crate::engine::reference::{self, Value};
 use crate::scene::FocalStack;
 use crate::simd::{InstructionSet, Products};
