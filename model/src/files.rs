@@ -18,6 +18,7 @@ use serde::{Deserialize, Serialize};
 use crate::conditions::WIDEST_PUPIL;
 use crate::picture::srgb8;
 use crate::safetensors_file::{self, Tensor};
+use crate::whole_file::{self, Unread};
 use crate::{ComplexHologram, LinearImage, PhasePattern};
 
 /// The value of the metadata key `format` of a hologram file.
@@ -208,18 +209,15 @@ impl StoredHologram {
 
     /// Reads what [`Self::save`] wrote.
     pub fn load(path: &Path) -> Result<Self, FileError> {
-        let io = |source| FileError::Io { path: path.to_owned(), source };
         let content = |found: String, expected: &str| FileError::Content {
             path: path.to_owned(),
             found,
             expected: format!("{expected}; write the hologram again with `holod render`"),
         };
-        let metadata = std::fs::metadata(path).map_err(io)?;
-        if !metadata.is_file() || metadata.len() > LARGEST_FILE_BYTES {
-            let found = if metadata.is_file() { format!("{} bytes", metadata.len()) } else { "no regular file".into() };
-            return Err(content(found, "a hologram file of at most 1 GiB"));
-        }
-        let bytes = std::fs::read(path).map_err(io)?;
+        let bytes = whole_file::read(path, LARGEST_FILE_BYTES).map_err(|unread| match unread {
+            Unread::NoFile { found } => content(found, "a hologram file of at most 1 GiB"),
+            Unread::System(source) => FileError::Io { path: path.to_owned(), source },
+        })?;
         let damaged = |error: safetensors::SafeTensorError| content(error.to_string(), "a safetensors file");
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged)?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(damaged)?;

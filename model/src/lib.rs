@@ -21,6 +21,7 @@ pub mod scene;
 pub mod scene_shard;
 mod simd;
 pub mod weights;
+mod whole_file;
 mod worker_pool;
 #[cfg(test)]
 mod worst;

@@ -1,5 +1,6 @@
 //! What a scene is made of: `scene.toml`, a pair of files, or one OpenEXR file.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
@@ -7,6 +8,7 @@ use toml::Spanned;
 
 use super::depth::DepthReading;
 use super::{DepthEncoding, SceneError, raster};
+use crate::whole_file::{self, Unread};
 
 /// Scene files are small; a larger one is something else.
 const LARGEST_FILE_BYTES: u64 = 1 << 20;
@@ -189,12 +191,11 @@ fn read_scene_file(path: &Path, named: Option<DepthEncoding>) -> Result<Descript
 /// The text of a file that describes pictures.
 pub(super) fn read_text(path: &Path, expected: &'static str) -> Result<String, SceneError> {
     let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected };
-    let metadata = std::fs::metadata(path).map_err(read_error)?;
-    if !metadata.is_file() || metadata.len() > LARGEST_FILE_BYTES {
-        let found = if metadata.is_file() { format!("{} bytes", metadata.len()) } else { "no regular file".into() };
-        return Err(SceneError::Kind { path: path.to_owned(), found, expected });
-    }
-    std::fs::read_to_string(path).map_err(read_error)
+    let bytes = whole_file::read(path, LARGEST_FILE_BYTES).map_err(|unread| match unread {
+        Unread::NoFile { found } => SceneError::Kind { path: path.to_owned(), found, expected },
+        Unread::System(source) => read_error(source),
+    })?;
+    String::from_utf8(bytes).map_err(|error| read_error(io::Error::new(io::ErrorKind::InvalidData, error.utf8_error())))
 }
 
 /// What is wrong at `offset` of the text of such a file.

@@ -18,6 +18,7 @@ use twox_hash::XxHash3_64;
 use self::metadata::Metadata;
 use self::tensors::TensorReader;
 use crate::conditions::BenchFit;
+use crate::whole_file::{self, Unread};
 
 pub use self::config::{Architecture, Grid, NetworkConfig};
 pub(crate) use self::config::{CONDITIONS, LIT, MOST_DEPTH_LAYERS, OUTPUT_CHANNELS, REFINED};
@@ -60,13 +61,10 @@ impl Weights {
 
     /// Reads and checks a weights file.
     pub fn load(path: &Path) -> Result<Self, WeightsError> {
-        let read_error = |source| WeightsError::Read { path: path.to_owned(), source };
-        let metadata = std::fs::metadata(path).map_err(read_error)?;
-        if !metadata.is_file() || metadata.len() > LARGEST_FILE_BYTES {
-            let found = if metadata.is_file() { format!("{} bytes", metadata.len()) } else { "no regular file".into() };
-            return Err(WeightsError::NotAFile { path: path.to_owned(), found });
-        }
-        let bytes = std::fs::read(path).map_err(read_error)?;
+        let bytes = whole_file::read(path, LARGEST_FILE_BYTES).map_err(|unread| match unread {
+            Unread::NoFile { found } => WeightsError::NotAFile { path: path.to_owned(), found },
+            Unread::System(source) => WeightsError::Read { path: path.to_owned(), source },
+        })?;
         let weights = Self::from_bytes(&bytes, &path.display().to_string())?;
         Ok(Self { file_xxh3: Some(XxHash3_64::oneshot(&bytes)), ..weights })
     }
