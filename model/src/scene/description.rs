@@ -223,132 +223,25 @@ fn line_at(text: &str, offset: usize) -> usize {
 
 /// Reads a scene file, beside which `named` was named.
 fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Description, SceneError> {
-    let error_at =
-        |offset: usize, key: &str, found: String, expected: &str| line_error(path, text, offset, key, found, expected);
-    let file: SceneFile = toml::from_str(text).map_err(|error| {
-        let span = error.span().unwrap_or_default();
-        let key = text.get(span.clone()).filter(|key| !key.is_empty() && key.len() < 60 && !key.contains('\n'));
-        error_at(span.start, key.unwrap_or("scene"), error.message().to_string(), KEYS)
-    })?;
-
-    let name = file.depth_encoding.get_ref().as_str();
-    let bounds = (file.near_dpt.as_ref(), file.far_dpt.as_ref());
-    let encoding = match (name, bounds) {
-        ("metres", _) => DepthEncoding::Metres,
-        ("millimetres", _) => DepthEncoding::Millimetres,
-        ("dioptres", _) => DepthEncoding::Dioptres,
-        ("normalised_dioptres", (Some(near), Some(far))) => {
-            let (near_dpt, far_dpt) = (*near.get_ref(), *far.get_ref());
-            if !(far_dpt >= 0.0 && near_dpt > far_dpt && near_dpt.is_finite()) {
-                let found = format!("{near_dpt} with far_dpt {far_dpt}");
-                return Err(error_at(
-                    near.span().start,
-                    "near_dpt",
-                    found,
-                    "more dioptres than far_dpt, which is at least 0",
-                ));
-            }
-            DepthEncoding::NormalisedDioptres { far_dpt, near_dpt }
-        }
-        ("normalised_dioptres", _) => {
-            let found = "normalised_dioptres without both near_dpt and far_dpt".into();
-            return Err(error_at(
-                file.depth_encoding.span().start,
-                "depth_encoding",
-                found,
-                "the vergences of 1 and 0 in dioptres",
-            ));
-        }
-        (other, _) => {
-            let expected = "metres, millimetres, dioptres or normalised_dioptres (with near_dpt and far_dpt)";
-            return Err(error_at(file.depth_encoding.span().start, "depth_encoding", format!("\"{other}\""), expected));
-        }
-    };
-    if !matches!(encoding, DepthEncoding::NormalisedDioptres { .. })
-        && let Some((key, bound)) =
-            file.near_dpt.as_ref().map(|near| ("near_dpt", near)).or(file.far_dpt.as_ref().map(|far| ("far_dpt", far)))
-    {
-        let found = format!("{} with depth_encoding \"{name}\"", bound.get_ref());
-        return Err(error_at(bound.span().start, key, found, "it only with normalised_dioptres"));
-    }
-    if let Some(named) = named.filter(|named| *named != encoding) {
-        let line = line_at(text, file.depth_encoding.span().start);
-        return Err(SceneError::EncodingsDiffer { path: path.to_owned(), line, own: encoding, named });
-    }
-    for (key, value) in [("depth_scale", &file.depth_scale), ("fps", &file.fps)] {
-        if let Some(value) = value
-            && !(*value.get_ref() > 0.0 && value.get_ref().is_finite())
-        {
-            return Err(error_at(value.span().start, key, value.get_ref().to_string(), "a positive number"));
-        }
-    }
-    if let Some(step) = &file.step
-        && *step.get_ref() == 0
-    {
-        return Err(error_at(step.span().start, "step", "0".into(), "at least 1"));
-    }
-
-    let directory = path.parent().unwrap_or(Path::new(""));
-    let pattern = |key: &str, text: &Spanned<String>| {
-        FilePattern::parse(text.get_ref(), directory).ok_or_else(|| {
-            let expected = "a file name, with at most one {} or {:05} for the frame's number";
-            error_at(text.span().start, key, format!("\"{}\"", text.get_ref()), expected)
-        })
-    };
-    let colour = pattern("colour", &file.colour)?;
+    let source = Source { path, text };
+    let file = source.keys()?;
+    let encoding = source.depth_encoding(&file, named)?;
+    source.check_numbers(&file)?;
+    let colour = source.pattern("colour", &file.colour)?;
     let depth = match &file.depth {
-        Some(depth) => pattern("depth", depth)?,
+        Some(depth) => source.pattern("depth", depth)?,
         None => colour.clone(),
     };
     let numbered_key = file.depth.as_ref().filter(|_| !colour.numbered()).unwrap_or(&file.colour);
-    let sequence_line = line_at(text, numbered_key.span().start);
     let first = file.first.as_ref().map_or(0, |first| *first.get_ref());
     let step = file.step.as_ref().map_or(1, |step| *step.get_ref());
-    let numbered = colour.numbered() || depth.numbered();
+    let numbered = [&colour, &depth].into_iter().any(FilePattern::numbered);
     let frames = match &file.count {
-        Some(count) if !(1..=MOST_FRAMES).contains(count.get_ref()) => {
-            let expected = format!("1 to {MOST_FRAMES}");
-            return Err(error_at(count.span().start, "count", count.get_ref().to_string(), &expected));
-        }
-        Some(count) if *count.get_ref() > 1 && !numbered => {
-            let expected = "1, or a {} for the frame's number in colour or depth";
-            return Err(error_at(count.span().start, "count", count.get_ref().to_string(), expected));
-        }
-        Some(count) => *count.get_ref(),
-        None if numbered => {
-            let there = |index: u64| {
-                let number = first.saturating_add(index.saturating_mul(step));
-                colour.path(number).exists() && depth.path(number).exists()
-            };
-            let frames = (0..MOST_FRAMES).take_while(|&index| there(index)).count() as u64;
-            let missing = first.saturating_add(frames.saturating_mul(step));
-            if let Some(greatest) =
-                [&colour, &depth].into_iter().filter_map(|files| files.greatest(missing, first, step)).max()
-            {
-                let path = [&colour, &depth].map(|files| files.path(missing)).into_iter().find(|path| !path.exists());
-                let path = path.unwrap_or_else(|| colour.path(missing));
-                let found = format!("none, and {} is missing where files go on to number {greatest}", path.display());
-                let cure = match frames {
-                    0 => "the number of the first frame as `first`".into(),
-                    _ => format!("`count = {frames}` for the frames before it alone"),
-                };
-                let expected = format!("a file for each number: supply it, or write {cure}");
-                return Err(error_at(numbered_key.span().start, "count", found, &expected));
-            }
-            // A sequence without its first frame is reported when that is loaded.
-            frames.max(1)
-        }
+        Some(count) => source.given_count(count, numbered)?,
+        None if numbered => source.frames_there([&colour, &depth], first, step, numbered_key)?,
         None => 1,
     };
-    let last = (frames - 1).checked_mul(step).and_then(|distance| first.checked_add(distance));
-    if last.is_none() {
-        // The largest of them, most likely, is the one that is not meant.
-        let keys = [("first", &file.first), ("step", &file.step), ("count", &file.count)];
-        let given = keys.into_iter().filter_map(|(key, value)| Some((key, value.as_ref()?)));
-        let (key, value) = given.max_by_key(|(_, value)| *value.get_ref()).expect("nothing overflows by itself");
-        let found = format!("{} for the {frames} frames {first}, {first} + {step} and so on", value.get_ref());
-        return Err(error_at(value.span().start, key, found, "frame numbers below 2^64"));
-    }
+    source.check_last(&file, frames, first, step)?;
     Ok(Description {
         path: path.to_owned(),
         colour,
@@ -361,9 +254,150 @@ fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Descri
         frames: frames as usize,
         first,
         step,
+        sequence_line: source.line(numbered_key),
         fps: file.fps.map(Spanned::into_inner),
-        sequence_line,
     })
+}
+
+/// A scene file's text, for errors that say where in it.
+struct Source<'a> {
+    path: &'a Path,
+    text: &'a str,
+}
+
+impl Source<'_> {
+    fn error<T>(&self, at: &Spanned<T>, key: &str, found: String, expected: &str) -> SceneError {
+        line_error(self.path, self.text, at.span().start, key, found, expected)
+    }
+
+    fn line<T>(&self, at: &Spanned<T>) -> usize {
+        line_at(self.text, at.span().start)
+    }
+
+    fn keys(&self) -> Result<SceneFile, SceneError> {
+        toml::from_str(self.text).map_err(|error| {
+            let span = error.span().unwrap_or_default();
+            let key = self.text.get(span.clone());
+            let key = key.filter(|key| !key.is_empty() && key.len() < 60 && !key.contains('\n')).unwrap_or("scene");
+            line_error(self.path, self.text, span.start, key, error.message().to_string(), KEYS)
+        })
+    }
+
+    /// What depths are written as, and that `named` is no other.
+    fn depth_encoding(&self, file: &SceneFile, named: Option<DepthEncoding>) -> Result<DepthEncoding, SceneError> {
+        let name = file.depth_encoding.get_ref().as_str();
+        let own = match name {
+            "metres" => DepthEncoding::Metres,
+            "millimetres" => DepthEncoding::Millimetres,
+            "dioptres" => DepthEncoding::Dioptres,
+            "normalised_dioptres" => self.normalised_dioptres(file)?,
+            other => {
+                let expected = "metres, millimetres, dioptres or normalised_dioptres (with near_dpt and far_dpt)";
+                return Err(self.error(&file.depth_encoding, "depth_encoding", format!("\"{other}\""), expected));
+            }
+        };
+        let bounds = [("near_dpt", &file.near_dpt), ("far_dpt", &file.far_dpt)];
+        if !matches!(own, DepthEncoding::NormalisedDioptres { .. })
+            && let Some((key, bound)) = bounds.into_iter().find_map(|(key, bound)| Some((key, bound.as_ref()?)))
+        {
+            let found = format!("{} with depth_encoding \"{name}\"", bound.get_ref());
+            return Err(self.error(bound, key, found, "it only with normalised_dioptres"));
+        }
+        match named.filter(|named| *named != own) {
+            None => Ok(own),
+            Some(named) => {
+                let line = self.line(&file.depth_encoding);
+                Err(SceneError::EncodingsDiffer { path: self.path.to_owned(), line, own, named })
+            }
+        }
+    }
+
+    fn normalised_dioptres(&self, file: &SceneFile) -> Result<DepthEncoding, SceneError> {
+        let (Some(near), Some(far)) = (&file.near_dpt, &file.far_dpt) else {
+            let found = "normalised_dioptres without both near_dpt and far_dpt".into();
+            let expected = "the vergences of 1 and 0 in dioptres";
+            return Err(self.error(&file.depth_encoding, "depth_encoding", found, expected));
+        };
+        let (near_dpt, far_dpt) = (*near.get_ref(), *far.get_ref());
+        if !(far_dpt >= 0.0 && near_dpt > far_dpt && near_dpt.is_finite()) {
+            let found = format!("{near_dpt} with far_dpt {far_dpt}");
+            return Err(self.error(near, "near_dpt", found, "more dioptres than far_dpt, which is at least 0"));
+        }
+        Ok(DepthEncoding::NormalisedDioptres { far_dpt, near_dpt })
+    }
+
+    fn check_numbers(&self, file: &SceneFile) -> Result<(), SceneError> {
+        for (key, value) in [("depth_scale", &file.depth_scale), ("fps", &file.fps)] {
+            if let Some(value) = value
+                && !(*value.get_ref() > 0.0 && value.get_ref().is_finite())
+            {
+                return Err(self.error(value, key, value.get_ref().to_string(), "a positive number"));
+            }
+        }
+        match &file.step {
+            Some(step) if *step.get_ref() == 0 => Err(self.error(step, "step", "0".into(), "at least 1")),
+            _ => Ok(()),
+        }
+    }
+
+    fn pattern(&self, key: &str, text: &Spanned<String>) -> Result<FilePattern, SceneError> {
+        let directory = self.path.parent().unwrap_or(Path::new(""));
+        FilePattern::parse(text.get_ref(), directory).ok_or_else(|| {
+            let expected = "a file name, with at most one {} or {:05} for the frame's number";
+            self.error(text, key, format!("\"{}\"", text.get_ref()), expected)
+        })
+    }
+
+    /// The number of frames that the file names.
+    fn given_count(&self, count: &Spanned<u64>, numbered: bool) -> Result<u64, SceneError> {
+        let frames = *count.get_ref();
+        let refused = |expected: &str| Err(self.error(count, "count", frames.to_string(), expected));
+        match frames {
+            1..=MOST_FRAMES if frames == 1 || numbered => Ok(frames),
+            1..=MOST_FRAMES => refused("1, or a {} for the frame's number in colour or depth"),
+            _ => refused(&format!("1 to {MOST_FRAMES}")),
+        }
+    }
+
+    /// The number of frames that have files, from `first` on without a gap.
+    fn frames_there(
+        &self,
+        files: [&FilePattern; 2],
+        first: u64,
+        step: u64,
+        key: &Spanned<String>,
+    ) -> Result<u64, SceneError> {
+        let number = |index: u64| first.saturating_add(index.saturating_mul(step));
+        let is_there = |&index: &u64| files.iter().all(|files| files.path(number(index)).exists());
+        let frames = (0..MOST_FRAMES).take_while(is_there).count() as u64;
+        let missing = number(frames);
+        let Some(greatest) = files.iter().filter_map(|files| files.greatest(missing, first, step)).max() else {
+            // A sequence without its first frame is reported when that is loaded.
+            return Ok(frames.max(1));
+        };
+        let paths = files.map(|files| files.path(missing));
+        let path = paths.iter().find(|path| !path.exists()).unwrap_or(&paths[0]);
+        let found = format!("none, and {} is missing where files go on to number {greatest}", path.display());
+        let cure = match frames {
+            0 => "the number of the first frame as `first`".into(),
+            _ => format!("`count = {frames}` for the frames before it alone"),
+        };
+        let expected = format!("a file for each number: supply it, or write {cure}");
+        Err(self.error(key, "count", found, &expected))
+    }
+
+    /// Refuses frames whose last number is too large.
+    fn check_last(&self, file: &SceneFile, frames: u64, first: u64, step: u64) -> Result<(), SceneError> {
+        if (frames - 1).checked_mul(step).and_then(|distance| first.checked_add(distance)).is_some() {
+            return Ok(());
+        }
+        // The largest of them, most likely, is the one that is not meant.
+        let keys = [("first", &file.first), ("step", &file.step), ("count", &file.count)];
+        let given = keys.into_iter().filter_map(|(key, value)| Some((key, value.as_ref()?)));
+        let (key, value) = given.max_by_key(|(_, value)| *value.get_ref()).expect("nothing overflows by itself");
+        let found = format!("{} for the {frames} frames {first}, {first} + {step} and so on", value.get_ref());
+        Err(self.error(value, key, found, "frame numbers below 2^64"))
+    }
 }
 
 /// What a scene file can say, for errors.
