@@ -3,105 +3,56 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::gate::{Rejection, Verdict};
-use crate::import::{LOG_FAULT_NAMES, LogFault};
+use crate::import::LogFault;
 use crate::wire::WireFault;
 
-/// One thing that is counted, beside the reasons for rejection.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Counter {
-    /// Bytes read from a port.
-    Bytes,
-    /// Samples decoded.
-    Samples,
-    /// Samples that the gate believed.
-    Accepted,
-    /// Messages that are neither samples nor faults, such as comments.
-    Notes,
-    /// Messages whose beginning was missed when a link was opened.
-    Partials,
-    /// Times at which running numbers were skipped, and did not come after others.
-    SequenceGaps,
-    /// Running numbers skipped in all that did not come after others.
-    SequenceMissing,
-    /// Running numbers skipped that came after others.
-    SequenceOvertaken,
-    /// Samples whose number and eye had come before.
-    SequenceRepeats,
-    /// Times at which the running number fell.
-    SequenceRestarts,
-    /// Times at which the port was opened.
-    Connects,
-    /// Times at which the port was lost.
-    Disconnects,
-    /// Tries to open it again.
-    ReconnectAttempts,
-    /// Times at which an open port fell silent.
-    Silences,
-    /// Times at which the tracker's clock was reset or stepped.
-    ClockResets,
-    /// Times at which the tracker's clock leapt away before anything was known of it.
-    ClockLeaps,
-    /// Times at which a looped log began again.
-    Loops,
-    /// Decisions that the tap had no room for.
-    DecisionsDropped,
-    /// Datagrams of other senders than the one that is followed.
-    Strangers,
-}
-
-impl Counter {
-    /// Every counter, in the order of their indices.
-    pub const ALL: [Self; 19] = [
-        Self::Bytes,
-        Self::Samples,
-        Self::Accepted,
-        Self::Notes,
-        Self::Partials,
-        Self::SequenceGaps,
-        Self::SequenceMissing,
-        Self::SequenceOvertaken,
-        Self::SequenceRepeats,
-        Self::SequenceRestarts,
-        Self::Connects,
-        Self::Disconnects,
-        Self::ReconnectAttempts,
-        Self::Silences,
-        Self::ClockResets,
-        Self::ClockLeaps,
-        Self::Loops,
-        Self::DecisionsDropped,
-        Self::Strangers,
-    ];
-
-    /// The name used in records.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Bytes => "bytes",
-            Self::Samples => "samples",
-            Self::Accepted => "accepted",
-            Self::Notes => "notes",
-            Self::Partials => "partials",
-            Self::SequenceGaps => "sequence_gaps",
-            Self::SequenceMissing => "sequence_missing",
-            Self::SequenceOvertaken => "sequence_overtaken",
-            Self::SequenceRepeats => "sequence_repeats",
-            Self::SequenceRestarts => "sequence_restarts",
-            Self::Connects => "connects",
-            Self::Disconnects => "disconnects",
-            Self::ReconnectAttempts => "reconnect_attempts",
-            Self::Silences => "silences",
-            Self::ClockResets => "clock_resets",
-            Self::ClockLeaps => "clock_leaps",
-            Self::Loops => "loops",
-            Self::DecisionsDropped => "decisions_dropped",
-            Self::Strangers => "datagrams_of_others",
-        }
+crate::named::named! {
+    /// One thing that is counted, beside the reasons for rejection.
+    pub enum Counter {
+        /// Bytes read from a port.
+        Bytes = "bytes",
+        /// Samples decoded.
+        Samples = "samples",
+        /// Samples that the gate believed.
+        Accepted = "accepted",
+        /// Messages that are neither samples nor faults, such as comments.
+        Notes = "notes",
+        /// Messages whose beginning was missed when a link was opened.
+        Partials = "partials",
+        /// Times at which running numbers were skipped, and did not come after others.
+        SequenceGaps = "sequence_gaps",
+        /// Running numbers skipped in all that did not come after others.
+        SequenceMissing = "sequence_missing",
+        /// Running numbers skipped that came after others.
+        SequenceOvertaken = "sequence_overtaken",
+        /// Samples whose number and eye had come before.
+        SequenceRepeats = "sequence_repeats",
+        /// Times at which the running number fell.
+        SequenceRestarts = "sequence_restarts",
+        /// Times at which the port was opened.
+        Connects = "connects",
+        /// Times at which the port was lost.
+        Disconnects = "disconnects",
+        /// Tries to open it again.
+        ReconnectAttempts = "reconnect_attempts",
+        /// Times at which an open port fell silent.
+        Silences = "silences",
+        /// Times at which the tracker's clock was reset or stepped.
+        ClockResets = "clock_resets",
+        /// Times at which the tracker's clock leapt away before anything was known of it.
+        ClockLeaps = "clock_leaps",
+        /// Times at which a looped log began again.
+        Loops = "loops",
+        /// Decisions that the tap had no room for.
+        DecisionsDropped = "decisions_dropped",
+        /// Datagrams of other senders than the one that is followed.
+        Strangers = "datagrams_of_others",
     }
 }
 
 const COUNTERS: usize = Counter::ALL.len();
 const REJECTIONS: usize = Rejection::ALL.len();
-const FAULTS: usize = LOG_FAULT_NAMES.len();
+const FAULTS: usize = LogFault::NAMES.len();
 
 /// The counters themselves; written by the tracker's thread only. All but the gaps only grow: the missing numbers are
 /// all that were skipped.
@@ -223,7 +174,7 @@ impl CounterSnapshot {
     /// Every name with its count: counters, then `wire_*` and `log_*` faults, then `rejected_*`.
     pub fn entries(&self) -> impl Iterator<Item = (String, u64)> {
         let counts = Counter::ALL.into_iter().map(|counter| (counter.name().to_owned(), self.of(counter)));
-        let faults = LOG_FAULT_NAMES.into_iter().zip(self.faults).map(|(name, count)| (name.to_owned(), count));
+        let faults = LogFault::NAMES.into_iter().zip(self.faults).map(|(name, count)| (name.to_owned(), count));
         let rejected =
             Rejection::ALL.into_iter().map(|reason| (format!("rejected_{}", reason.name()), self.rejected(reason)));
         counts.chain(faults).chain(rejected)

@@ -73,69 +73,31 @@ impl Default for GateSettings {
     }
 }
 
-/// Why a sample was not believed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Rejection {
-    /// Of an eye that does not drive the display.
-    OtherEye,
-    /// It comes late: its time is before its predecessor's.
-    Backwards,
-    /// Its time is its predecessor's.
-    Repeated,
-    /// The tracker itself says that it sees no pupil.
-    Lost,
-    /// Diameter, confidence or aperture is NaN or infinite.
-    NotFinite,
-    /// The diameter is none of a human pupil.
-    OutOfRange,
-    /// The tracker's confidence is low.
-    LowConfidence,
-    /// The lids are nearly closed.
-    LidsClosed,
-    /// It stepped, or moved since the oldest sample that waits, faster than a pupil moves.
-    Slew,
-    /// It is out of reach of the estimate.
-    OutOfReach,
-    /// It is close to a bad sample or to a gap.
-    Guard,
-}
-
-impl Rejection {
-    /// Every reason, in the order of their indices.
-    pub const ALL: [Self; 11] = [
-        Self::OtherEye,
-        Self::Backwards,
-        Self::Repeated,
-        Self::Lost,
-        Self::NotFinite,
-        Self::OutOfRange,
-        Self::LowConfidence,
-        Self::LidsClosed,
-        Self::Slew,
-        Self::OutOfReach,
-        Self::Guard,
-    ];
-
-    /// Its place in [`Self::ALL`].
-    pub const fn index(self) -> usize {
-        self as usize
-    }
-
-    /// The name under which it is counted and plotted.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::OtherEye => "other_eye",
-            Self::Backwards => "backwards",
-            Self::Repeated => "repeated",
-            Self::Lost => "lost",
-            Self::NotFinite => "not_finite",
-            Self::OutOfRange => "out_of_range",
-            Self::LowConfidence => "low_confidence",
-            Self::LidsClosed => "lids_closed",
-            Self::Slew => "slew",
-            Self::OutOfReach => "out_of_reach",
-            Self::Guard => "guard",
-        }
+crate::named::named! {
+    /// Why a sample was not believed.
+    pub enum Rejection {
+        /// Of an eye that does not drive the display.
+        OtherEye = "other_eye",
+        /// It comes late: its time is before its predecessor's.
+        Backwards = "backwards",
+        /// Its time is its predecessor's.
+        Repeated = "repeated",
+        /// The tracker itself says that it sees no pupil.
+        Lost = "lost",
+        /// Diameter, confidence or aperture is NaN or infinite.
+        NotFinite = "not_finite",
+        /// The diameter is none of a human pupil.
+        OutOfRange = "out_of_range",
+        /// The tracker's confidence is low.
+        LowConfidence = "low_confidence",
+        /// The lids are nearly closed.
+        LidsClosed = "lids_closed",
+        /// It stepped, or moved since the oldest sample that waits, faster than a pupil moves.
+        Slew = "slew",
+        /// It is out of reach of the estimate.
+        OutOfReach = "out_of_reach",
+        /// It is close to a bad sample or to a gap.
+        Guard = "guard",
     }
 }
 

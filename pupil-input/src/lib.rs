@@ -30,6 +30,7 @@
 //! slides to the fallback at 1.3 mm/s; when samples come back, what is shown meets them at 4 mm/s. Neither is
 //! faster than the peak of the light reflex, 5.5 mm/s.
 
+mod cells;
 mod clock;
 mod clock_watch;
 mod counters;
@@ -40,6 +41,7 @@ mod filter;
 pub mod fuzzing;
 mod gate;
 mod import;
+mod named;
 mod profile;
 mod record;
 mod refusals;

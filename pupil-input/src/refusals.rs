@@ -522,6 +522,12 @@ fn wire_advice(fault: WireFault) -> String {
              take a copy of its profile with size = \"pixels\" and set scale_mm_per_unit"
                 .into()
         }
+        WireFault::MoreFields => {
+            "lines hold more figures than the tracker's header, or `columns = [...]` of its profile, has names: where the \
+             sender writes decimal commas (3,75 for 3.75), let it write points, or part its columns by another sign; else \
+             name all of its columns in the profile"
+                .into()
+        }
         WireFault::MoreViews => {
             "it sends figures of more eyes or cameras than the profile has: take a copy of the profile with eyes = \"two\" \
              and no eye at the top, or with stereo = true, and name it (profile=./FILE.toml)"
@@ -905,6 +911,7 @@ mod tests {
             (WireFault::Malformed, "profile and baud"),
             (WireFault::NotFinite, "NaN"),
             (WireFault::MoreViews, "eyes = \"two\""),
+            (WireFault::MoreFields, "decimal commas"),
         ] {
             let counters = Counters::new();
             let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));

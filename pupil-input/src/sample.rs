@@ -4,24 +4,22 @@ use std::fmt;
 
 use holod_calibration::TimeNs;
 
-/// Which eye a sample was taken of.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum SampleEye {
-    /// The left eye.
-    Left,
-    /// The right eye.
-    Right,
-    /// Both: the tracker gives one figure for the pair.
-    Both,
+crate::named::named! {
+    /// Which eye a sample was taken of.
+    pub enum SampleEye {
+        /// The left eye.
+        Left = "left",
+        /// The right eye.
+        Right = "right",
+        /// Both: the tracker gives one figure for the pair.
+        Both = "both",
+    }
 }
 
 impl SampleEye {
-    /// Left, right, both.
-    pub const ALL: [Self; 3] = [Self::Left, Self::Right, Self::Both];
-
-    /// 0 for left, 1 for right, 2 for both.
-    pub const fn index(self) -> usize {
-        self as usize
+    /// The eye of this name.
+    pub(crate) fn named(name: &[u8]) -> Option<Self> {
+        Self::ALL.into_iter().find(|eye| eye.name().as_bytes() == name)
     }
 
     /// The letter that stands for it on the wire.
@@ -36,11 +34,7 @@ impl SampleEye {
 
 impl fmt::Display for SampleEye {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Left => "left",
-            Self::Right => "right",
-            Self::Both => "both",
-        })
+        f.write_str(self.name())
     }
 }
 

@@ -16,8 +16,10 @@ use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample, usual_step};
 use super::rows::Blink;
-use super::table::{Row, cells, is_missing, ns_of, ns_per_unit, number, time_ns};
+use super::size::{ARBITRARY, Measure, Said, Unit};
+use super::table::{Row, is_missing, ns_of, ns_per_unit, number, time_ns};
 use crate::SampleEye;
+use crate::cells::{cells, has_more};
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Bids, recognises, read };
@@ -205,72 +207,42 @@ impl Sidecar {
     }
 
     fn eye(&self) -> SampleEye {
-        match self.text("RecordedEye").map(str::to_lowercase).as_deref() {
-            Some("left") => SampleEye::Left,
-            Some("right") => SampleEye::Right,
-            _ => SampleEye::Both,
-        }
+        let name = self.text("RecordedEye").map(str::to_lowercase);
+        name.and_then(|name| SampleEye::named(name.as_bytes())).unwrap_or(SampleEye::Both)
     }
 }
 
 /// How the figures of a pupil column become diameters.
 #[derive(Clone, Copy)]
 struct Size {
-    unit: SizeUnit,
-    factor: f64,
-    is_area: bool,
-    /// Why it may be the other, where the sidecar does not say clearly whether it is an area or a diameter.
+    unit: Unit,
+    measure: Measure,
+    /// Why it may be another, where the sidecar does not say clearly which it is.
     doubt: Option<&'static str>,
-}
-
-/// A unit of size and its factor to millimetres or pixels, if it is one that is known.
-fn unit_of_size(unit: &str) -> Option<(SizeUnit, f64)> {
-    Some(match unit {
-        "mm" | "millimetre" | "millimetres" | "millimeter" | "millimeters" => (SizeUnit::Millimetres, 1.0),
-        "cm" => (SizeUnit::Millimetres, 10.0),
-        "m" | "metre" | "meter" => (SizeUnit::Millimetres, 1e3),
-        "um" | "\u{b5}m" | "\u{3bc}m" => (SizeUnit::Millimetres, 1e-3),
-        "px" | "pixel" | "pixels" => (SizeUnit::Pixels, 1.0),
-        _ => return None,
-    })
 }
 
 impl Size {
     fn of(sidecar: &Sidecar, column: &str) -> Self {
         let says = |key| sidecar.of_column(column, key).unwrap_or_default().to_lowercase();
-        let stated = says("Units").replace(' ', "");
-        let squared = ["^2", "**2", "\u{b2}", "2"].iter().find_map(|power| unit_of_size(stated.strip_suffix(power)?));
-        let (unit, factor) = squared.or_else(|| unit_of_size(&stated)).unwrap_or((SizeUnit::Arbitrary, 1.0));
-
-        let column = column.to_lowercase();
-        let about = [says("Description"), says("LongName")];
-        let tells = |word: &str| about.iter().any(|text| text.contains(word));
-        let (tells_area, tells_diameter) = (tells("area"), tells("diam"));
-        // Pixels count areas as well as lengths.
-        let is_length = squared.is_none() && unit == SizeUnit::Millimetres;
-        let (is_area, doubt) = if squared.is_some() {
-            (true, None)
-        } else if column.contains("area") {
-            (true, is_length.then_some("its name says area and its unit is one of length"))
-        } else if is_length {
-            (
-                false,
-                (tells_area && !tells_diameter).then_some("its description says area and its unit is one of length"),
-            )
-        } else if ["diam", "radius"].iter().any(|word| column.contains(word)) {
-            (false, None)
-        } else {
-            let doubt =
-                (tells_area == tells_diameter).then_some("neither its unit nor its description says which it is");
-            (tells_area && !tells_diameter, doubt)
-        };
-        Self { unit, factor, is_area, doubt }
+        let unit = Unit::named(&says("Units")).unwrap_or(ARBITRARY);
+        let [description, name] = ["Description", "LongName"].map(says);
+        let (measure, doubt) = unit.measure(Said::by(&[&column.to_lowercase()]), Said::by(&[&description, &name]));
+        Self { unit, measure, doubt }
     }
 
     fn diameter(self, figure: f64) -> f64 {
-        self.factor * if self.is_area { 2.0 * (figure / std::f64::consts::PI).sqrt() } else { figure }
+        self.unit.factor * self.measure.diameter(figure)
     }
 }
+
+/// Whether a tick is one of a clock that counts tens, hundreds or the like of a unit of time.
+fn is_power_of_ten(ns: f64) -> bool {
+    let power = ns.log10();
+    (power - power.round()).abs() < POWER_WITHIN
+}
+
+/// How near to a power of ten a tick has to be, by the sampling frequency: 2 %.
+const POWER_WITHIN: f64 = 0.0086;
 
 /// One file with what its sidecar says.
 struct Part {
@@ -302,9 +274,7 @@ impl Part {
                     name if has(name, &["right"]) => SampleEye::Right,
                     _ => sidecar.eye(),
                 };
-                let mut size = Size::of(&sidecar, column);
-                size.factor *= if has(&name, &["radius"]) { 2.0 } else { 1.0 };
-                is_pupil.then_some((index, eye, size))
+                is_pupil.then(|| (index, eye, Size::of(&sidecar, column)))
             })
             .collect();
         let wrong = |found: &str, expected: &str| ReplayError::Content {
@@ -368,6 +338,13 @@ impl Part {
         let ns = 1e9 / (rate_hz * ticks);
         // A unit of time where it is near one, any rate of ticks otherwise.
         let near = [1e9, 1e6, 1e3, 1.0].into_iter().find(|unit| (0.8..1.25).contains(&(ns / unit)));
+        if stated.is_none() && near.is_none() && !is_power_of_ten(ns) {
+            log.warn(format!(
+                "{}: its times have no unit, and by the `SamplingFrequency` of {rate_hz} Hz one is {ns} ns, which is none: is \
+                 that frequency right? The usual step of `{name}` is {ticks}; give it its \"Units\", such as \"s\" or \"ms\"",
+                self.path.display()
+            ));
+        }
         let ns = near.unwrap_or(ns);
         let stated = stated.map_or("no unit".into(), |unit| format!("the unit `{}`", unit.escape_debug()));
         log.note(format!(
@@ -383,15 +360,26 @@ impl Part {
         let start_s = self.sidecar.number("StartTime").unwrap_or(0.0);
         let at_row = |row: f64| ns_of(start_s + row / rate_hz.unwrap_or(1.0), 1e9);
         for (column, eye, size) in &self.pupils {
-            if size.is_area {
-                log.note(format!("{}: the {eye} eye's pupil areas were made diameters", self.path.display()));
+            if size.unit.unit != unit {
+                log.warn(format!(
+                    "{}: the {eye} eye is left out: `{}` is in {}, and the first eye's pupil in {}; give one unit for both",
+                    self.sidecar.path.display(),
+                    self.sidecar.columns()[*column].escape_debug(),
+                    size.unit.unit.name(),
+                    unit.name()
+                ));
+                continue;
+            }
+            if size.measure != Measure::Diameter {
+                let what = size.measure.plural();
+                log.note(format!("{}: the {eye} eye's pupil {what} were made diameters", self.path.display()));
             }
             if let Some(doubt) = size.doubt {
                 log.warn(format!(
                     "{}: `{column}` is taken for {}, though {doubt}; give it \"Units\": \"mm\" for diameters or \"mm^2\" \
                      for areas, or a \"Description\" that says diameter or area where its unit is arbitrary",
                     self.sidecar.path.display(),
-                    if size.is_area { "areas" } else { "diameters" },
+                    size.measure.plural(),
                     column = self.sidecar.columns()[*column].escape_debug(),
                 ));
             }
@@ -400,6 +388,7 @@ impl Part {
         let input = self.input();
         let mut lines = input.lines()?;
         let width = 1 + self.pupils.iter().map(|pupil| pupil.0).chain(self.time).max().unwrap_or(0);
+        let names = self.sidecar.columns().len();
         let mut bounds = Vec::with_capacity(width);
         let mut rows = 0_u64;
         while let Some(line) = lines.next(log) {
@@ -408,6 +397,11 @@ impl Part {
             }
             if rows == 0 && self.is_header(line.bytes) {
                 log.note(format!("{}: a line of names was skipped; BIDS has none", self.path.display()));
+                continue;
+            }
+            if has_more(line.bytes, b'\t', names) {
+                log.has_more_cells(line.number);
+                rows += 1;
                 continue;
             }
             let row = Row::cut(line.bytes, line.number, b'\t', width, &mut bounds);
@@ -427,18 +421,12 @@ impl Part {
                 }
             };
             for &(column, eye, size) in &self.pupils {
-                if size.unit != unit {
+                if size.unit.unit != unit {
                     continue;
                 }
                 let figure = row.cell(column).and_then(|cell| if is_missing(cell) { Ok(0.0) } else { number(cell) });
-                match figure {
-                    Ok(figure) => {
-                        let diameter = size.diameter(figure.max(0.0)) as f32;
-                        let (confidence, valid) = (1.0, figure > 0.0);
-                        log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, row.number);
-                    }
-                    Err(fault) => log.count(fault),
-                }
+                let diameter = figure.map(|figure| size.diameter(figure.max(0.0)));
+                log.push_sized(diameter, LogSample::lost(t, eye), row.number);
             }
         }
         self.read_blinks(ns_per_tick, log);
@@ -522,6 +510,14 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
                 if part.eyes().all(is_news) && !known.contains(&SampleEye::Both) {
                     log.note(format!("{} was read too", path.display()));
                     parts.push(part);
+                } else if part.eyes().any(|eye| eye != SampleEye::Both && known.contains(&eye)) {
+                    let eyes: Vec<_> = part.eyes().map(SampleEye::name).collect();
+                    log.warn(format!(
+                        "{} was left out: by its sidecar it is of an eye that was read already ({}); is its `RecordedEye` \
+                         right?",
+                        path.display(),
+                        eyes.join(", ")
+                    ));
                 }
             }
         }
@@ -531,7 +527,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
 
 fn read_parts(parts: &[Part], log: &mut LogBuilder) -> Result<(), ReplayError> {
     let Some(first) = parts.first() else { return Ok(()) };
-    log.unit = first.pupils[0].2.unit;
+    log.unit = first.pupils[0].2.unit.unit;
     log.stated_rate_hz = first.sidecar.rate_hz();
     if let Some(kind) = first.sidecar.text("PhysioType").filter(|kind| *kind != "eyetrack") {
         log.warn(format!("the sidecar's PhysioType is `{}`, not `eyetrack`", kind.escape_debug()));

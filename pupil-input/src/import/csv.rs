@@ -34,6 +34,7 @@ fn recognises(input: &LogInput<'_>) -> bool {
 
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let Some(mut table) = Table::open(input, log, |line| unit(line).is_some())? else { return Ok(()) };
+    table.look_for_headers(0);
     log.unit = unit(table.names.join(",").as_bytes()).unwrap_or_default();
     while let Some(row) = table.next_row(log) {
         match sample(&row) {
@@ -46,12 +47,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
 
 fn sample(row: &Row<'_>) -> Result<LogSample, LogFault> {
     let t = TimeNs(time_ns(row.cell(0)?, 1.0)?);
-    let eye = match row.cell(1)? {
-        b"left" => SampleEye::Left,
-        b"right" => SampleEye::Right,
-        b"both" => SampleEye::Both,
-        _ => return Err(LogFault::Malformed),
-    };
+    let eye = SampleEye::named(row.cell(1)?).ok_or(LogFault::Malformed)?;
     let valid = match row.cell(5)? {
         b"1" => true,
         b"0" => false,

@@ -182,23 +182,18 @@ impl Reader<'_> {
             Eyes::Two => [Some(SampleEye::Left), Some(SampleEye::Right)],
         };
         for eye in eyes.into_iter().flatten() {
-            match words.nth(2).map_or(Err(LogFault::Malformed), |word| self.diameter(word)) {
-                Err(fault) => self.log.count(fault),
-                Ok(diameter) => {
-                    let valid = diameter > 0.0;
-                    self.log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm: None, valid }, number);
-                }
-            }
+            let size = words.nth(2).map_or(Err(LogFault::Malformed), |word| self.diameter(word));
+            self.log.push_sized(size, LogSample::lost(t, eye), number);
         }
     }
 
     /// 0 where the eye is lost.
-    fn diameter(&self, word: &[u8]) -> Result<f32, LogFault> {
+    fn diameter(&self, word: &[u8]) -> Result<f64, LogFault> {
         let figure = positive_size(word)?;
         Ok(match self.measure {
-            Some(Measure::Diameter) => figure as f32,
+            Some(Measure::Diameter) => figure,
             // The tracker's default.
-            None | Some(Measure::Area) => (2.0 * (figure / PI).sqrt()) as f32,
+            None | Some(Measure::Area) => 2.0 * (figure / PI).sqrt(),
         })
     }
 

@@ -52,68 +52,35 @@ pub enum ReplayError {
     },
 }
 
-/// Why a line or a cell of a log was rejected.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum LogFault {
-    /// A message of a wire format with this fault.
-    Wire(WireFault),
-    /// A row that is too short or not text.
-    Malformed,
-    /// A line longer than any of a log.
-    TooLong,
-    /// The eye is none that the format knows.
-    BadEye,
-    /// Time or diameter is not a number.
-    BadNumber,
-    /// The diameter is missing.
-    Missing,
-    /// The diameter is NaN or infinite.
-    NotFinite,
-    /// The diameter is negative.
-    Negative,
-    /// The time lies before its predecessor's.
-    Backwards,
-}
-
-/// The names under which faults are counted, in the order of [`LogFault::index`].
-pub(crate) const LOG_FAULT_NAMES: [&str; 8 + WireFault::ALL.len()] = {
-    let mut names = [""; 8 + WireFault::ALL.len()];
-    let mut k = 0;
-    while k < WireFault::ALL.len() {
-        names[k] = WireFault::ALL[k].name();
-        k += 1;
-    }
-    names[k] = "log_malformed";
-    names[k + 1] = "log_bad_number";
-    names[k + 2] = "log_missing";
-    names[k + 3] = "log_not_finite";
-    names[k + 4] = "log_negative";
-    names[k + 5] = "log_backwards";
-    names[k + 6] = "log_too_long";
-    names[k + 7] = "log_bad_eye";
-    names
-};
-
-impl LogFault {
-    pub(crate) const fn index(self) -> usize {
-        let lines = WireFault::ALL.len();
-        match self {
-            Self::Wire(fault) => fault.index(),
-            Self::Malformed => lines,
-            Self::BadNumber => lines + 1,
-            Self::Missing => lines + 2,
-            Self::NotFinite => lines + 3,
-            Self::Negative => lines + 4,
-            Self::Backwards => lines + 5,
-            Self::TooLong => lines + 6,
-            Self::BadEye => lines + 7,
-        }
+crate::named::named! {
+    /// Why a line or a cell of a log was rejected.
+    pub enum LogFault {
+        /// A message of a wire format with this fault.
+        Wire(WireFault),
+        /// A row that is too short or too long, or not text.
+        Malformed = "log_malformed",
+        /// Time or diameter is not a number.
+        BadNumber = "log_bad_number",
+        /// The diameter is missing.
+        Missing = "log_missing",
+        /// The diameter is NaN or infinite.
+        NotFinite = "log_not_finite",
+        /// The diameter is negative.
+        Negative = "log_negative",
+        /// The time lies before its predecessor's.
+        Backwards = "log_backwards",
+        /// A line longer than any of a log.
+        TooLong = "log_too_long",
+        /// The eye is none that the format knows.
+        BadEye = "log_bad_eye",
+        /// The confidence lies outside 0 to 1.
+        BadConfidence = "log_bad_confidence",
     }
 }
 
 /// How many lines or cells of a log were rejected, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct LogFaults([u64; LOG_FAULT_NAMES.len()]);
+pub struct LogFaults([u64; LogFault::NAMES.len()]);
 
 impl LogFaults {
     /// How many were rejected for `fault`.
@@ -128,7 +95,7 @@ impl LogFaults {
 
     /// Each reason's name and count.
     pub fn entries(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        LOG_FAULT_NAMES.into_iter().zip(self.0)
+        LogFault::NAMES.into_iter().zip(self.0)
     }
 
     pub(crate) const fn count(&mut self, fault: LogFault) {
@@ -152,9 +119,9 @@ mod tests {
 
     #[test]
     fn every_fault_has_a_name_of_its_own() {
-        assert_eq!(LOG_FAULT_NAMES.iter().collect::<HashSet<_>>().len(), LOG_FAULT_NAMES.len());
-        assert_eq!(LOG_FAULT_NAMES[LogFault::TooLong.index()], "log_too_long");
-        assert_eq!(LOG_FAULT_NAMES[LogFault::BadEye.index()], "log_bad_eye");
-        assert_eq!(LOG_FAULT_NAMES[LogFault::Malformed.index()], "log_malformed");
+        assert_eq!(LogFault::NAMES.iter().collect::<HashSet<_>>().len(), LogFault::NAMES.len());
+        assert_eq!(LogFault::NAMES[LogFault::TooLong.index()], "log_too_long");
+        assert_eq!(LogFault::NAMES[LogFault::BadEye.index()], "log_bad_eye");
+        assert_eq!(LogFault::NAMES[LogFault::Malformed.index()], "log_malformed");
     }
 }

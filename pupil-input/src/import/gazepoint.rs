@@ -9,8 +9,9 @@ use super::input::LogInput;
 use super::parts::is_restart;
 use super::recording::{LogBuilder, LogSample};
 use super::rows::Blink;
-use super::table::{Row, Table, cells, is_missing, number, separator, time_ns};
+use super::table::{Row, Table, is_missing, number, time_ns};
 use crate::SampleEye;
+use crate::cells::{cells, separator};
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Gazepoint, recognises, read };
@@ -62,6 +63,9 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         log.note(format!("the header says that it began at {}", begin.escape_debug()));
     }
 
+    table.look_for_headers(clock.column);
+    // The name of the time may hold the date.
+    table.compare_names_by(|one, other| one == other || is_time(one) && is_time(other));
     while let Some(row) = table.next_row(log) {
         let t = match row.cell(clock.column).and_then(|cell| time_ns(cell, clock.ns_per_unit)) {
             Ok(t_ns) => TimeNs(t_ns),
@@ -71,13 +75,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
             }
         };
         for (diameter, validity, eye) in eyes.into_iter().flatten() {
-            match figure(&row, diameter, validity) {
-                Ok((diameter, valid)) => {
-                    let sample = LogSample { t, eye, diameter, confidence: 1.0, aperture_mm: None, valid };
-                    log.push(sample, row.number);
-                }
-                Err(fault) => log.count(fault),
-            }
+            log.push_sized(figure(&row, diameter, validity), LogSample::lost(t, eye), row.number);
         }
         blinks.take(&row, t, log);
     }
@@ -115,20 +113,21 @@ fn choose_clock(input: &LogInput<'_>) -> Result<Option<Clock>, ReplayError> {
     Ok(Some(if agree { ticks } else { seconds }))
 }
 
-fn figure(row: &Row<'_>, diameter: usize, validity: Option<usize>) -> Result<(f32, bool), LogFault> {
+/// A diameter, 0 where the tracker did not see the pupil.
+fn figure(row: &Row<'_>, diameter: usize, validity: Option<usize>) -> Result<f64, LogFault> {
     let seen = match validity {
         None => true,
         Some(column) => number(row.cell(column)?)? == 1.0,
     };
     let cell = row.cell(diameter)?;
     if !seen && is_missing(cell) {
-        return Ok((0.0, false));
+        return Ok(0.0);
     }
     if cell.is_empty() {
         return Err(LogFault::Missing);
     }
-    let diameter = number(cell)? as f32;
-    Ok((diameter, seen && diameter > 0.0))
+    let diameter = number(cell)?;
+    Ok(if seen { diameter } else { 0.0 })
 }
 
 /// Blinks, each once. `BKID` is a blink's number while it lasts and 0 between; `BKDUR` is its length in seconds, comes

@@ -268,11 +268,7 @@ fn eye_info(recording: &Recording, eye: SampleEye, scale: f32) -> Option<(EyeInf
     let blinks = runs.iter().filter(|run| is_blink(run)).count();
 
     let info = EyeInfo {
-        eye: match eye {
-            SampleEye::Left => "left",
-            SampleEye::Right => "right",
-            SampleEye::Both => "both",
-        },
+        eye: eye.name(),
         samples,
         valid,
         lost: samples - valid,

@@ -22,6 +22,7 @@ mod pupilext;
 pub(crate) mod raw;
 mod recording;
 mod rows;
+mod size;
 mod smi;
 mod table;
 mod text;
@@ -31,7 +32,6 @@ mod xdf;
 
 use std::path::Path;
 
-pub(crate) use fault::LOG_FAULT_NAMES;
 pub use fault::{LogFault, LogFaults, ReplayError};
 pub use format::LogFormat;
 use importer::Importer;

@@ -16,9 +16,9 @@ use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
 use super::rows::Blink;
-use super::table::separator;
 use super::text::{Header, Picker, number, positive_size, time};
 use crate::SampleEye;
+use crate::cells::separator;
 
 pub(super) const CLOUD: Importer =
     Importer { format: LogFormat::NeonEyeStates, recognises: recognises_cloud, read: read_cloud };
@@ -34,7 +34,10 @@ const DIAMETERS: [(&str, &str, SampleEye); 3] = [
 ];
 
 fn recognises_cloud(input: &LogInput<'_>) -> bool {
-    let Some(line) = input.head_lines().next() else { return false };
+    input.head_lines().next().is_some_and(is_cloud_header)
+}
+
+fn is_cloud_header(line: &[u8]) -> bool {
     let header = Header::of(line, separator(line));
     header.has(TIME) && DIAMETERS.iter().any(|(diameter, _, _)| header.has(diameter))
 }
@@ -53,6 +56,16 @@ fn read_cloud(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayEr
             continue;
         }
         let [t, diameters @ .., lid_left, lid_right, lid_both] = picker.pick(line.bytes);
+        if let Some(is_same) = header.again(line.bytes, t, is_cloud_header) {
+            if log.header_again(line.number, is_same) {
+                continue;
+            }
+            return Ok(());
+        }
+        if header.leaves_over(line.bytes) {
+            log.has_more_cells(line.number);
+            continue;
+        }
         let Some(t) = t else {
             log.count(LogFault::Malformed);
             continue;
@@ -63,15 +76,10 @@ fn read_cloud(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayEr
         };
         let lids = [lid_left, lid_right, lid_both];
         for (index, (_, _, eye)) in DIAMETERS.into_iter().enumerate().filter(|(index, _)| there[*index]) {
-            match diameters[index].map_or(Err(LogFault::Malformed), positive_size) {
-                Err(fault) => log.count(fault),
-                Ok(diameter) => {
-                    // Nothing, NaN and 0 are its words for an eye that it does not see.
-                    let (diameter, valid) = (diameter as f32, diameter > 0.0);
-                    let aperture_mm = lids[index].and_then(number).map(|aperture| aperture as f32);
-                    log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm, valid }, line.number);
-                }
-            }
+            // Nothing, NaN and 0 are its words for an eye that it does not see.
+            let size = diameters[index].map_or(Err(LogFault::Malformed), positive_size);
+            let aperture_mm = lids[index].and_then(number).map(|aperture| aperture as f32);
+            log.push_sized(size, LogSample { aperture_mm, ..LogSample::lost(t, eye) }, line.number);
         }
     }
     read_cloud_blinks(&input.path.with_file_name("blinks.csv"), log);
@@ -206,16 +214,13 @@ fn read_native(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayE
         for (index, eye) in [SampleEye::Left, SampleEye::Right].into_iter().enumerate() {
             let Some(diameter) = layout.diameters[index].map(|at| float(&record, at)) else { continue };
             let aperture_mm = layout.apertures[index].map(|at| float(&record, at)).filter(|lid| lid.is_finite());
-            if diameter.is_infinite() {
-                log.count(LogFault::NotFinite);
-            } else if diameter < 0.0 {
-                log.count(LogFault::Negative);
-            } else {
-                // NaN and 0 are its words for an eye that it does not see.
-                let valid = diameter > 0.0;
-                let diameter = if valid { diameter } else { 0.0 };
-                log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm, valid }, number);
-            }
+            // NaN and 0 are its words for an eye that it does not see.
+            let size = match diameter {
+                diameter if diameter.is_infinite() => Err(LogFault::NotFinite),
+                diameter if diameter < 0.0 => Err(LogFault::Negative),
+                diameter => Ok(f64::from(if diameter > 0.0 { diameter } else { 0.0 })),
+            };
+            log.push_sized(size, LogSample { aperture_mm, ..LogSample::lost(t, eye) }, number);
         }
     }
     times_input.failed()?;

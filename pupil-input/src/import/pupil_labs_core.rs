@@ -1,17 +1,19 @@
 //! Pupil Labs Core: `pupil_positions.csv` of its player.
 //!
 //! Both eyes and two kinds of rows interleave: 2-D detection with a diameter in camera pixels, and the 3-D model with
-//! `diameter_3d` in millimetres besides. Where there are 3-D rows the 2-D ones tell nothing more and are left out. Eye
-//! 0 is the right one.
+//! `diameter_3d` in millimetres besides. Where there are 3-D rows the 2-D ones tell nothing more and are left out; the
+//! log is read twice, to know of which kind each eye has rows. Eye 0 is the right one.
+
+use holod_calibration::TimeNs;
 
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
-use super::table::separator;
-use super::text::{Header, Picker, number, size, time};
+use super::text::{Header, Picker, number, share, size, time};
 use crate::SampleEye;
+use crate::cells::separator;
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Core, recognises, read };
@@ -21,7 +23,10 @@ const TIME: [&str; 2] = ["pupil_timestamp", "timestamp"];
 const EYE: [&str; 2] = ["eye_id", "id"];
 
 fn recognises(input: &LogInput<'_>) -> bool {
-    let Some(line) = input.head_lines().next() else { return false };
+    input.head_lines().next().is_some_and(is_header)
+}
+
+fn is_header(line: &[u8]) -> bool {
     let header = Header::of(line, separator(line));
     header.first_of(&TIME).is_some()
         && header.first_of(&EYE).is_some()
@@ -39,6 +44,18 @@ enum Method {
     PostHocModel,
 }
 
+const METHODS: [Method; 3] = [Method::TwoD, Method::LiveModel, Method::PostHocModel];
+
+impl Method {
+    const fn in_words(self) -> &'static str {
+        match self {
+            Self::TwoD => "2-D detection",
+            Self::LiveModel => "the 3-D model",
+            Self::PostHocModel => "the 3-D model that was fitted after the fact",
+        }
+    }
+}
+
 fn method(name: Option<&[u8]>, diameter_mm: Option<&[u8]>) -> Method {
     let name = name.unwrap_or_default();
     let has = |part: &[u8]| memchr::memmem::find(name, part).is_some();
@@ -51,7 +68,23 @@ fn method(name: Option<&[u8]>, diameter_mm: Option<&[u8]>) -> Method {
     }
 }
 
-fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+/// The cells of a row that matter.
+struct Row<'l> {
+    line: u64,
+    t: &'l [u8],
+    eye: SampleEye,
+    confidence: &'l [u8],
+    method: Method,
+    /// The method's.
+    diameter: &'l [u8],
+}
+
+/// Hands out every row; lines that are none are counted.
+fn each_row(
+    input: &LogInput<'_>,
+    log: &mut LogBuilder,
+    mut take: impl FnMut(&mut LogBuilder, &Row<'_>),
+) -> Result<(), ReplayError> {
     let mut lines = input.lines()?;
     let Some(header) = lines.header(log) else { return Ok(()) };
     let columns = [
@@ -63,73 +96,170 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         header.column("diameter_3d"),
     ];
     let picker = Picker::new(header.separator, columns);
-
-    // Of each method; only the best is kept.
-    let mut kept: [LogBuilder; 3] = Default::default();
-    let mut counts = [0_u64; 3];
-    let mut best = Method::TwoD;
     while let Some(line) = lines.next(log) {
         if line.bytes.is_empty() {
             continue;
         }
-        let [t, eye, confidence, diameter_px, name, diameter_mm] = picker.pick(line.bytes);
-        let (Some(t), Some(eye), Some(confidence), Some(diameter_px)) = (t, eye, confidence, diameter_px) else {
+        let cells = picker.pick(line.bytes);
+        let [t, eye, confidence, diameter_px, name, diameter_mm] = cells;
+        if let Some(is_same) = header.again(line.bytes, t, is_header) {
+            if log.header_again(line.number, is_same) {
+                continue;
+            }
+            break;
+        }
+        if header.leaves_over(line.bytes) {
+            log.has_more_cells(line.number);
+            continue;
+        }
+        // Whatever it is, a row that ends before its columns do is none.
+        let is_cut_off = columns.iter().zip(cells).any(|(column, cell)| column.is_some() && cell.is_none());
+        let (Some(t), Some(eye), Some(confidence), Some(diameter_px), false) =
+            (t, eye, confidence, diameter_px, is_cut_off)
+        else {
             log.count(LogFault::Malformed);
             continue;
         };
-        // Whatever it is, a row that ends before its columns do is none.
-        let cut_off = |column: usize, cell: Option<&[u8]>| columns[column].is_some() && cell.is_none();
-        if cut_off(4, name) || cut_off(5, diameter_mm) {
-            log.count(LogFault::Malformed);
-            continue;
-        }
+        let eye = match eye {
+            b"0" => SampleEye::Right,
+            b"1" => SampleEye::Left,
+            _ => {
+                log.count(LogFault::BadEye);
+                continue;
+            }
+        };
         let method = method(name, diameter_mm);
-        counts[method as usize] += 1;
-        if (method as usize) < best as usize {
-            continue;
-        }
-        best = method;
-        let cell = if method == Method::TwoD { Some(diameter_px) } else { diameter_mm };
-        match sample(t, eye, confidence, cell) {
-            Err(fault) => log.count(fault),
-            Ok(sample) => kept[method as usize].push(sample, line.number),
-        }
+        let diameter = if method == Method::TwoD { diameter_px } else { diameter_mm.unwrap_or_default() };
+        take(log, &Row { line: line.number, t, eye, confidence, method, diameter });
+    }
+    Ok(())
+}
+
+/// How many rows there are, and from when to when.
+#[derive(Clone, Copy, Debug, Default)]
+struct Extent {
+    rows: u64,
+    within: Option<(TimeNs, TimeNs)>,
+}
+
+impl Extent {
+    fn take(&mut self, t: TimeNs) {
+        self.rows += 1;
+        self.within = Some(self.within.map_or((t, t), |(first, last)| (first.min(t), last.max(t))));
     }
 
-    let [two_d, live, post_hoc] = counts;
-    log.take_samples_of(std::mem::take(&mut kept[best as usize]));
-    match best {
-        Method::TwoD => {
-            log.unit = SizeUnit::Pixels;
-            log.note(
+    fn and(self, other: Self) -> Self {
+        let ends = self.within.into_iter().chain(other.within);
+        let within = ends.reduce(|one, other| (one.0.min(other.0), one.1.max(other.1)));
+        Self { rows: self.rows + other.rows, within }
+    }
+
+    fn length_s(self) -> f64 {
+        self.within.map_or(0.0, |(first, last)| last.seconds() - first.seconds())
+    }
+}
+
+/// A choice of rows that leaves out more than this of an eye's time is told.
+const GREATEST_LOSS: f64 = 0.1;
+
+/// What there is of each eye by each method.
+#[derive(Debug, Default)]
+struct Survey([[Extent; 3]; 3]);
+
+impl Survey {
+    fn of(input: &LogInput<'_>) -> Result<Self, ReplayError> {
+        let mut survey = Self::default();
+        each_row(input, &mut LogBuilder::default(), |_, row| {
+            if let Some(t) = time(row.t, 0) {
+                survey.0[row.eye.index()][row.method as usize].take(t);
+            }
+        })?;
+        Ok(survey)
+    }
+
+    fn rows(&self, method: Method) -> u64 {
+        self.0.iter().map(|eye| eye[method as usize].rows).sum()
+    }
+
+    fn is_in_millimetres(&self) -> bool {
+        self.rows(Method::LiveModel) + self.rows(Method::PostHocModel) > 0
+    }
+
+    /// The best method that an eye has; where one eye has millimetres, pixels are none.
+    fn chosen(&self, eye: SampleEye) -> Option<Method> {
+        let of_eye = &self.0[eye.index()];
+        let best = METHODS.into_iter().rev().find(|method| of_eye[*method as usize].rows > 0)?;
+        (best != Method::TwoD || !self.is_in_millimetres()).then_some(best)
+    }
+
+    fn tell(&self, log: &mut LogBuilder) {
+        let [two_d, live, post_hoc] = METHODS.map(|method| self.rows(method));
+        let chosen = [SampleEye::Left, SampleEye::Right].map(|eye| self.chosen(eye));
+        let has = |method: Method| chosen.contains(&Some(method));
+        match (has(Method::PostHocModel), has(Method::LiveModel)) {
+            (true, true) => log.note(
+                "diameters of the one eye are those of the 3-D model that was fitted after the fact, and those of the other \
+                 eye, which has no such rows, of the live model",
+            ),
+            (true, false) if two_d + live > 0 => log.note(format!(
+                "diameters are those of the 3-D model that was fitted after the fact, {post_hoc} rows; {live} rows of the \
+                 live model and {two_d} of 2-D detection are left out"
+            )),
+            (false, true) if two_d > 0 => log.note(format!(
+                "diameters are those of the 3-D model, {live} rows; {two_d} rows of 2-D detection are left out"
+            )),
+            (false, false) => log.note(
                 "there are only rows of 2-D detection: diameters are in pixels of the eye cameras; to have millimetres, \
                  run the 3-D detector after the fact in Pupil Player, or give the rig a scale",
-            );
+            ),
+            _ => {}
         }
-        Method::LiveModel if two_d > 0 => log.note(format!(
-            "diameters are those of the 3-D model, {live} rows; {two_d} rows of 2-D detection are left out"
-        )),
-        Method::PostHocModel if two_d + live > 0 => log.note(format!(
-            "diameters are those of the 3-D model that was fitted after the fact, {post_hoc} rows; {live} rows of the \
-             live model and {two_d} of 2-D detection are left out"
-        )),
-        Method::LiveModel | Method::PostHocModel => {}
+        for eye in [SampleEye::Left, SampleEye::Right] {
+            let of_eye = self.0[eye.index()];
+            let all = of_eye.into_iter().fold(Extent::default(), Extent::and);
+            let all_s = all.length_s();
+            match self.chosen(eye) {
+                None if all.rows > 0 => log.warn(format!(
+                    "the {eye} eye is left out: its {} rows are of 2-D detection, in pixels, and the other eye's are in \
+                     millimetres; run the 3-D detector of both eyes in Pupil Player and export again",
+                    all.rows
+                )),
+                Some(method) if of_eye[method as usize].length_s() < (1.0 - GREATEST_LOSS) * all_s => log.warn(format!(
+                    "of the {eye} eye's {all_s:.1} s only {:.1} s were read, in which it has rows of {}; run the 3-D \
+                     detector over the whole recording in Pupil Player and export again",
+                    of_eye[method as usize].length_s(),
+                    method.in_words()
+                )),
+                _ => {}
+            }
+        }
     }
+}
+
+fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let survey = Survey::of(input)?;
+    if !survey.is_in_millimetres() {
+        log.unit = SizeUnit::Pixels;
+    }
+    let chosen = SampleEye::ALL.map(|eye| survey.chosen(eye));
+    each_row(input, log, |log, row| {
+        if chosen[row.eye.index()] == Some(row.method)
+            && let Err(fault) = take(row, log)
+        {
+            log.count(fault);
+        }
+    })?;
+    survey.tell(log);
     Ok(())
 }
 
 /// A model that was not fitted says 0, a negative diameter, NaN or nothing, and confidence 0 says that there is no pupil:
 /// such samples are lost. A model fitted badly says 16 mm; that is handed on for the gate to judge.
-fn sample(t: &[u8], eye: &[u8], confidence: &[u8], diameter: Option<&[u8]>) -> Result<LogSample, LogFault> {
-    let t = time(t, 0).ok_or(LogFault::BadNumber)?;
-    let eye = match eye {
-        b"0" => SampleEye::Right,
-        b"1" => SampleEye::Left,
-        _ => return Err(LogFault::BadEye),
-    };
-    let confidence = number(confidence).filter(|confidence| confidence.is_finite()).ok_or(LogFault::BadNumber)?;
-    let diameter = size(diameter.ok_or(LogFault::Malformed)?)?;
-    let valid = diameter > 0.0 && confidence > 0.0;
-    let confidence = confidence.clamp(0.0, 1.0) as f32;
-    Ok(LogSample { t, eye, diameter: diameter as f32, confidence, aperture_mm: None, valid })
+fn take(row: &Row<'_>, log: &mut LogBuilder) -> Result<(), LogFault> {
+    let t = time(row.t, 0).ok_or(LogFault::BadNumber)?;
+    let confidence = number(row.confidence).filter(|confidence| confidence.is_finite()).ok_or(LogFault::BadNumber)?;
+    let confidence = share(confidence)?;
+    let size = size(row.diameter).map(|size| if confidence > 0.0 { size } else { 0.0 });
+    log.push_sized(size, LogSample { confidence, ..LogSample::lost(t, row.eye) }, row.line);
+    Ok(())
 }

@@ -14,9 +14,10 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
-use super::table::{Row, Table, cells, number, separator, time_ns};
+use super::table::{Row, Table, number, time_ns};
 use super::text::size;
 use crate::SampleEye;
+use crate::cells::{cells, separator};
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::PupilExt, recognises, read };
@@ -101,6 +102,11 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     {
         log.note("two cameras looked at each pupil; pixels and confidence are the main one's");
     }
+    table.look_for_headers(time);
+    // The user's own text.
+    if table.column(|name| name == "message").is_some() {
+        table.allow_more_cells();
+    }
     while let Some(row) = table.next_row(log) {
         let t = match row.cell(time).and_then(|cell| time_ns(cell, 1e6)) {
             Ok(t) => TimeNs(t),
@@ -111,14 +117,8 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         };
         for pupil in pupils.iter().flatten() {
             let Some(column) = pupil.sizes()[size] else { continue };
-            match figure(&row, column) {
-                Ok(diameter) => {
-                    let (eye, valid) = (pupil.eye, diameter > 0.0);
-                    let confidence = confidence(&row, pupil);
-                    log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, row.number);
-                }
-                Err(fault) => log.count(fault),
-            }
+            let lost = LogSample { confidence: confidence(&row, pupil), ..LogSample::lost(t, pupil.eye) };
+            log.push_sized(figure(&row, column), lost, row.number);
         }
     }
     Ok(())
@@ -148,8 +148,8 @@ fn choose_size(input: &LogInput<'_>) -> Result<Option<usize>, ReplayError> {
 }
 
 /// -1, 0 or nothing where no pupil was found.
-fn figure(row: &Row<'_>, column: usize) -> Result<f32, LogFault> {
-    Ok(size(row.cell(column)?)? as f32)
+fn figure(row: &Row<'_>, column: usize) -> Result<f64, LogFault> {
+    size(row.cell(column)?)
 }
 
 /// The detector's confidence, the outline's where the detector has none (-1), 1 without either.

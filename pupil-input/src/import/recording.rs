@@ -1,5 +1,6 @@
 //! What an importer fills, and the recording that comes of it.
 
+use std::fmt;
 use std::path::Path;
 
 use holod_calibration::{Sorted, TimeNs};
@@ -27,6 +28,13 @@ pub(crate) struct LogSample {
     pub(crate) valid: bool,
 }
 
+impl LogSample {
+    /// One in which the tracker saw no pupil, of a log without confidence and lids.
+    pub(crate) const fn lost(t: TimeNs, eye: SampleEye) -> Self {
+        Self { t, eye, diameter: 0.0, confidence: 1.0, aperture_mm: None, valid: false }
+    }
+}
+
 /// What an importer fills.
 #[derive(Debug, Default)]
 pub(crate) struct LogBuilder {
@@ -47,6 +55,11 @@ pub(crate) struct LogBuilder {
     /// Lines or rows whose time could be read.
     times: u64,
     first_backwards: Option<u64>,
+    /// Rows that hold more than the header names, and the line of the first.
+    wide: Option<(u64, u64)>,
+    /// Lines in which the header came again, and that of one that names other columns.
+    headers: LineList,
+    other_header: Option<u64>,
     /// The last line, where the file ends within it, and how many malformed ones there were before it.
     unended: Option<(u64, u64)>,
     parts: Parts,
@@ -70,6 +83,36 @@ pub(super) const GREATEST_NS: u64 = 3_200_000_000_000_000_000;
 impl LogBuilder {
     pub(crate) fn count(&mut self, fault: LogFault) {
         self.faults.count(fault);
+    }
+
+    /// Takes a sample with its size, which is 0 or less where the pupil is lost. A size that is none is counted, and the
+    /// pupil is lost, unless the row ends before it: so the gate does not believe what is beside it either.
+    pub(crate) fn push_sized(&mut self, size: Result<f64, LogFault>, lost: LogSample, line: u64) {
+        match size {
+            Ok(size) => self.push(LogSample { diameter: size as f32, valid: size > 0.0, ..lost }, line),
+            Err(fault) => {
+                self.count(fault);
+                if fault != LogFault::Malformed {
+                    self.push(lost, line);
+                }
+            }
+        }
+    }
+
+    /// A row holds more cells than its header names, so that which is of which column is not known.
+    pub(crate) fn has_more_cells(&mut self, line: u64) {
+        self.count(LogFault::Malformed);
+        self.wide.get_or_insert((0, line)).0 += 1;
+    }
+
+    /// The header comes again; false where the rows behind it are of other columns, at which reading ends.
+    pub(crate) const fn header_again(&mut self, line: u64, is_same: bool) -> bool {
+        if is_same {
+            self.headers.take(line);
+        } else {
+            self.other_header = Some(line);
+        }
+        is_same
     }
 
     /// Takes a sample of line (or record) `line`, at the time that is written there; one that goes back a little
@@ -143,14 +186,6 @@ impl LogBuilder {
         }
     }
 
-    /// Takes what another builder was pushed in the place of its own samples, of which it has none.
-    pub(super) fn take_samples_of(&mut self, other: Self) {
-        let Self { rows, faults, times, first_backwards, parts, fallen, leaps, .. } = other;
-        self.faults += faults;
-        (self.rows, self.times, self.first_backwards) = (rows, times, first_backwards);
-        (self.parts, self.fallen, self.leaps) = (parts, fallen, leaps);
-    }
-
     /// The file ends within line `line`, which is handed out next.
     pub(super) const fn ends_within(&mut self, line: u64) {
         self.unended = Some((line, self.faults.of(LogFault::Malformed)));
@@ -189,6 +224,32 @@ impl LogBuilder {
 
     pub(super) fn finish(mut self, format: LogFormat, path: &Path) -> Result<Recording, ReplayError> {
         SampleEye::ALL.into_iter().for_each(|eye| self.reject_fallen(eye));
+        if let Some(line) = self.other_header {
+            return Err(ReplayError::Content {
+                path: path.into(),
+                at: format!(", line {line}"),
+                found: "another header, of other columns than the first".into(),
+                expected: "one table in a file; put that header and the rows behind it into a file of their own".into(),
+            });
+        }
+        if let Some((rows, line)) = self.wide {
+            self.warn(format!(
+                "{rows} rows hold more cells than there are names of columns, the first in line {line}, and were left out, \
+                 since which cell is of which column is not known: were decimal commas (3,75 for 3.75) written without \
+                 quotation marks, or a column without a name? Export the log again, with decimal points and a name for each \
+                 column"
+            ));
+        }
+        let unlikely = self.faults.of(LogFault::BadConfidence);
+        if unlikely > 0 {
+            self.warn(format!(
+                "{unlikely} samples were left out, whose confidence lies outside 0 to 1: is it in per cent? Let what wrote the \
+                 log divide it"
+            ));
+        }
+        if self.headers.count > 0 {
+            self.note(format!("its header comes again in {}: no row was made of that", self.headers));
+        }
         let backwards = self.faults.of(LogFault::Backwards);
         if backwards * 2 > self.times {
             let line = self.first_backwards.unwrap_or(0);
@@ -243,19 +304,14 @@ impl LogBuilder {
 
     /// Tells of the parts.
     fn end_parts(&mut self) {
-        let restarts = self.parts.restarts();
-        let count = restarts.len();
-        if count == 0 {
+        let mut restarts = LineList::default();
+        self.parts.restarts().for_each(|line| restarts.take(line));
+        if restarts.count == 0 {
             return;
         }
-        let lines: Vec<_> = restarts.take(RESTARTS_TOLD).map(|line| line.to_string()).collect();
-        let more = count - lines.len();
-        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
         self.warn(format!(
-            "the clock begins anew in {} {}{more}: each part was put 1 s behind the one before it; to read one \
-             alone, put its lines, below the header if there is one, into a file of their own",
-            if count == 1 { "line" } else { "lines" },
-            lines.join(", ")
+            "the clock begins anew in {restarts}: each part was put 1 s behind the one before it; to read one alone, put \
+             its lines, below the header if there is one, into a file of their own"
         ));
         if !self.blinks_beside.is_empty() {
             self.blinks_beside.clear();
@@ -264,8 +320,33 @@ impl LogBuilder {
     }
 }
 
-/// Lines in which a clock begins anew that are named.
-const RESTARTS_TOLD: usize = 5;
+/// Numbers of lines, of which the first are named.
+#[derive(Debug, Default)]
+struct LineList {
+    count: usize,
+    named: [u64; 5],
+}
+
+impl LineList {
+    const fn take(&mut self, line: u64) {
+        if self.count < self.named.len() {
+            self.named[self.count] = line;
+        }
+        self.count += 1;
+    }
+}
+
+impl fmt::Display for LineList {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let named = &self.named[..self.count.min(self.named.len())];
+        f.write_str(if self.count == 1 { "line " } else { "lines " })?;
+        for (index, line) in named.iter().enumerate() {
+            write!(f, "{}{line}", if index == 0 { "" } else { ", " })?;
+        }
+        let more = self.count - named.len();
+        if more > 0 { write!(f, " and {more} more") } else { Ok(()) }
+    }
+}
 
 /// A whole log in memory, in order of time.
 #[derive(Clone, Debug)]

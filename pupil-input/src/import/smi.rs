@@ -15,6 +15,7 @@ use super::recording::{LogBuilder, LogSample};
 use super::rows::Blink;
 use super::text::{Header, Picker, number, positive_size, time};
 use crate::SampleEye;
+use crate::cells::separator;
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Smi, recognises, read };
@@ -53,8 +54,7 @@ fn times(header: &Header) -> Option<(usize, i32)> {
 
 /// The names of columns, if this line is of them.
 fn header_of(line: &[u8]) -> Option<Header> {
-    let separator = *b"\t;,".iter().max_by_key(|separator| line.iter().filter(|byte| byte == separator).count())?;
-    let header = Header::of(line, separator);
+    let header = Header::of(line, separator(line));
     let sizes =
         EYES.iter().any(|eye| header.first_of(&eye.diameter_mm).is_some() || header.first_of(&eye.width_px).is_some());
     (sizes && times(&header).is_some() && (header.has("Type") || header.has("Trial"))).then_some(header)
@@ -114,11 +114,21 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         }
         let [t, kind, participant, left_size, left_height, right_size, right_height, left_event, right_event] =
             picker.pick(line.bytes);
+        if let Some(is_same) = header.again(line.bytes, t, |line| header_of(line).is_some()) {
+            if log.header_again(line.number, is_same) {
+                continue;
+            }
+            break;
+        }
         if has_type && kind.is_some_and(|kind| kind != b"SMP") {
             continue;
         }
         rows += 1;
         if participant.is_some_and(|participant| !first.has([participant])) {
+            continue;
+        }
+        if header.leaves_over(line.bytes) {
+            log.has_more_cells(line.number);
             continue;
         }
         let Some(t) = t else {
@@ -139,14 +149,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
                 // The disc of the area of the ellipse.
                 Some(_) => figure(height).map(|height| (width * height).sqrt()),
             });
-            match diameter {
-                Err(fault) => log.count(fault),
-                Ok(diameter) => {
-                    let (eye, valid) = (names.eye, diameter > 0.0);
-                    let diameter = diameter as f32;
-                    log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm: None, valid }, line.number);
-                }
-            }
+            log.push_sized(diameter, LogSample::lost(t, names.eye), line.number);
         }
         for ((shut, event), names) in blinks.iter_mut().zip([left_event, right_event]).zip(&EYES) {
             shut.note(t, event == Some(b"Blink"), names.eye, log);

@@ -6,42 +6,11 @@ use super::fault::{LogFault, ReplayError};
 use super::input::LogInput;
 use super::recording::{GREATEST_NS, LogBuilder};
 pub(super) use super::text::is_missing;
-use super::text::{self, Lines};
+use super::text::{self, Lines, is_word};
+use crate::cells::{cells, has_more, separator};
 
 /// Columns of a table that are told apart; later ones are not looked at.
 const MAX_COLUMNS: usize = 1 << 14;
-
-/// Which of tab, semicolon and comma parts the cells of `header`: the most frequent.
-pub(super) fn separator(header: &[u8]) -> u8 {
-    let count = |separator: u8| memchr::memchr_iter(separator, header).count();
-    b"\t;,".iter().copied().max_by_key(|separator| (count(*separator), *separator == b'\t')).unwrap_or(b',')
-}
-
-/// `line` cut at `separator`, the cells trimmed and without quotes around them. In a line with quotes, separators
-/// between two of them do not count, except in a line of tabs, where quotes are text.
-pub(super) fn cells(line: &[u8], separator: u8) -> impl Iterator<Item = &[u8]> {
-    let mut rest = Some(line);
-    let quoted = separator != b'\t' && memchr::memchr(b'"', line).is_some();
-    std::iter::from_fn(move || {
-        let line = rest?;
-        let end = if quoted {
-            let mut within = false;
-            line.iter().position(|&byte| {
-                within ^= byte == b'"';
-                byte == separator && !within
-            })
-        } else {
-            memchr::memchr(separator, line)
-        };
-        rest = end.map(|end| &line[end + 1..]);
-        Some(unquoted(&line[..end.unwrap_or(line.len())]))
-    })
-}
-
-fn unquoted(cell: &[u8]) -> &[u8] {
-    let cell = cell.trim_ascii();
-    cell.strip_prefix(b"\"").and_then(|cell| cell.strip_suffix(b"\"")).unwrap_or(cell)
-}
 
 /// A table with its names in one line and a row in each line after it.
 pub(super) struct Table {
@@ -50,6 +19,13 @@ pub(super) struct Table {
     pub(super) names: Vec<String>,
     /// Cells of a row that are looked at.
     width: usize,
+    /// The column of times, in which a row has no word.
+    time: Option<usize>,
+    is_header: fn(&[u8]) -> bool,
+    /// Whether two names are of the same column.
+    are_alike: fn(&str, &str) -> bool,
+    /// Columns of a row in all, where it cannot have more.
+    columns: Option<usize>,
     /// The row read last, its number, and begin and end of each of its cells.
     line: Vec<u8>,
     number: u64,
@@ -61,7 +37,7 @@ impl Table {
     pub(super) fn open(
         input: &LogInput<'_>,
         log: &mut LogBuilder,
-        is_header: impl Fn(&[u8]) -> bool,
+        is_header: fn(&[u8]) -> bool,
     ) -> Result<Option<Self>, ReplayError> {
         let mut lines = input.lines()?;
         let (separator, names) = loop {
@@ -69,9 +45,7 @@ impl Table {
                 None => return Ok(None),
                 Some(line) if is_header(line.bytes) => {
                     let separator = separator(line.bytes);
-                    let name = |cell: &[u8]| String::from_utf8_lossy(cell).into_owned();
-                    let names: Vec<_> = cells(line.bytes, separator).take(MAX_COLUMNS).map(name).collect();
-                    break (separator, names);
+                    break (separator, names(line.bytes, separator).collect::<Vec<_>>());
                 }
                 Some(_) => {}
             }
@@ -80,7 +54,34 @@ impl Table {
         if width < MAX_COLUMNS {
             lines.are_rows(separator, width);
         }
-        Ok(Some(Self { lines, separator, names, width, line: Vec::new(), number: 0, cells: Vec::new() }))
+        Ok(Some(Self {
+            lines,
+            separator,
+            names,
+            width,
+            time: None,
+            is_header,
+            are_alike: |one, other| one == other,
+            line: Vec::new(),
+            number: 0,
+            columns: (width < MAX_COLUMNS).then_some(width),
+            cells: Vec::new(),
+        }))
+    }
+
+    /// Looks for a header again where a row has a word in the column of times.
+    pub(super) const fn look_for_headers(&mut self, time: usize) {
+        self.time = Some(time);
+    }
+
+    /// Takes names of columns for the same by `are_alike`, where they hold what differs from file to file.
+    pub(super) const fn compare_names_by(&mut self, are_alike: fn(&str, &str) -> bool) {
+        self.are_alike = are_alike;
+    }
+
+    /// Rows may hold more than the header names, as a text of the user's does that has separators.
+    pub(super) const fn allow_more_cells(&mut self) {
+        self.columns = None;
     }
 
     /// The first column whose name `is` the one.
@@ -93,19 +94,42 @@ impl Table {
         self.width = columns.into_iter().max().map_or(0, |last| last + 1);
     }
 
-    /// The next row that is not empty; None at the end.
+    /// The next row that is neither empty nor longer than the header; None at the end, or at a header of other columns.
     pub(super) fn next_row(&mut self, log: &mut LogBuilder) -> Option<Row<'_>> {
         loop {
             let line = self.lines.next(log)?;
-            if !line.bytes.trim_ascii().is_empty() {
-                self.line.clear();
-                self.line.extend_from_slice(line.bytes);
-                self.number = line.number;
+            if line.bytes.trim_ascii().is_empty() {
+                continue;
+            }
+            self.line.clear();
+            self.line.extend_from_slice(line.bytes);
+            self.number = line.number;
+            Row::cut(&self.line, self.number, self.separator, self.width, &mut self.cells);
+            if self.is_header_again() {
+                let again: Vec<_> = names(&self.line, self.separator).collect();
+                let is_same = again.len() == self.names.len()
+                    && self.names.iter().zip(&again).all(|(one, other)| (self.are_alike)(one, other));
+                if !log.header_again(self.number, is_same) {
+                    return None;
+                }
+            } else if self.columns.is_some_and(|columns| has_more(&self.line, self.separator, columns)) {
+                log.has_more_cells(self.number);
+            } else {
                 break;
             }
         }
-        Some(Row::cut(&self.line, self.number, self.separator, self.width, &mut self.cells))
+        Some(Row { line: &self.line, cells: &self.cells, number: self.number })
     }
+
+    fn is_header_again(&self) -> bool {
+        let row = Row { line: &self.line, cells: &self.cells, number: self.number };
+        self.time.is_some_and(|time| row.cell(time).map_or(true, is_word)) && (self.is_header)(&self.line)
+    }
+}
+
+/// The names in a header.
+fn names(line: &[u8], separator: u8) -> impl Iterator<Item = String> {
+    cells(line, separator).take(MAX_COLUMNS).map(|cell| String::from_utf8_lossy(cell).into_owned())
 }
 
 /// One row of a [`Table`].
@@ -193,14 +217,5 @@ mod tests {
         }
         assert_eq!(time_ns(b"99999999999999999999", 1e9), Err(LogFault::BadNumber));
         assert_eq!(time_ns(b"1e300", 1e9), Err(LogFault::BadNumber));
-    }
-
-    #[test]
-    fn cells_are_cut_at_the_separator_and_not_within_quotes() {
-        let cut = |line: &'static str, separator| -> Vec<_> { cells(line.as_bytes(), separator).collect() };
-        assert_eq!(cut("a, \"b,c\" ,,\"d\"\"e\"", b','), [&b"a"[..], b"b,c", b"", b"d\"\"e"]);
-        assert_eq!(cut("a\t\"b\tc\"", b'\t'), [&b"a"[..], b"\"b", b"c\""]);
-        assert_eq!(cut("\"a;b", b';'), [b"\"a;b"]);
-        assert_eq!([separator(b"a,b\tc\td"), separator(b"a;b;c,d"), separator(b"a")], [b'\t', b';', b'\t']);
     }
 }

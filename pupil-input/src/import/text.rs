@@ -6,7 +6,7 @@ use holod_calibration::TimeNs;
 
 use super::fault::LogFault;
 use super::recording::LogBuilder;
-use super::table::separator;
+use crate::cells::{after_cell, first_cell, has_fewer, has_more, separator};
 
 /// A longer line is no line of any log: it is counted as [`LogFault::TooLong`] and never held.
 pub(crate) const MAX_LINE_BYTES: usize = 1 << 16;
@@ -137,9 +137,26 @@ impl Header {
         self.names.len()
     }
 
+    /// Whether a row holds something behind its last column, so that which cell is of which is not known.
+    pub(crate) fn leaves_over(&self, row: &[u8]) -> bool {
+        has_more(row, self.separator, self.len())
+    }
+
+    /// Whether `line`, whose cell `time` in the column of times was looked at, is no row but a header by `is_header`, as
+    /// in files that were put together, and then whether it names the same columns.
+    pub(crate) fn again(&self, line: &[u8], time: Option<&[u8]>, is_header: fn(&[u8]) -> bool) -> Option<bool> {
+        let is_again = time.is_none_or(is_word) && is_header(line.trim_ascii());
+        is_again.then(|| *self == Self::of(line, self.separator))
+    }
+
     pub(crate) fn has(&self, name: &str) -> bool {
         self.column(name).is_some()
     }
+}
+
+/// Whether a cell begins as no number does.
+pub(super) fn is_word(cell: &[u8]) -> bool {
+    cell.first().is_some_and(u8::is_ascii_alphabetic)
 }
 
 /// The cells of some columns, out of rows that may have many more.
@@ -174,37 +191,6 @@ impl<const N: usize> Picker<N> {
         }
         cells
     }
-}
-
-/// The first cell, trimmed, and what comes after its separator.
-fn first_cell(line: &[u8], separator: u8) -> (&[u8], Option<&[u8]>) {
-    let end = cell_end(line, separator);
-    let cell = line[..end].trim_ascii();
-    let cell = cell.strip_prefix(b"\"").and_then(|cell| cell.strip_suffix(b"\"")).unwrap_or(cell);
-    (cell, line.get(end + 1..))
-}
-
-fn after_cell(line: &[u8], separator: u8) -> Option<&[u8]> {
-    line.get(cell_end(line, separator) + 1..)
-}
-
-/// Whether a line that is not empty has fewer cells than `columns`.
-fn has_fewer(line: &[u8], separator: u8, columns: usize) -> bool {
-    let mut cells = 0;
-    let mut rest = Some(line).filter(|line| !line.trim_ascii().is_empty());
-    while let Some(line) = rest
-        && cells < columns
-    {
-        rest = after_cell(line, separator);
-        cells += 1;
-    }
-    (1..columns).contains(&cells)
-}
-
-fn cell_end(line: &[u8], separator: u8) -> usize {
-    let quoted =
-        if line.first() == Some(&b'"') { memchr::memchr(b'"', &line[1..]).map_or(0, |closing| closing + 2) } else { 0 };
-    memchr::memchr(separator, &line[quoted..]).map_or(line.len(), |length| quoted + length)
 }
 
 /// A decimal number as it is written: ±`digits`·10^`exponent`.
@@ -305,6 +291,14 @@ pub(super) fn size(cell: &[u8]) -> Result<f64, LogFault> {
 pub(super) fn positive_size(cell: &[u8]) -> Result<f64, LogFault> {
     size(cell).and_then(|size| if size < 0.0 { Err(LogFault::Negative) } else { Ok(size) })
 }
+
+/// A confidence, which is one from 0 to 1; what lies beside that by rounding is on it.
+pub(super) fn share(confidence: f64) -> Result<f32, LogFault> {
+    let is_one = (-ROUNDING..=1.0 + ROUNDING).contains(&confidence);
+    if is_one { Ok(confidence.clamp(0.0, 1.0) as f32) } else { Err(LogFault::BadConfidence) }
+}
+
+const ROUNDING: f64 = 1e-6;
 
 #[cfg(test)]
 mod tests {

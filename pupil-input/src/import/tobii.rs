@@ -13,8 +13,9 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample, usual_step};
-use super::table::{Row, Table, cells, is_missing, ns_per_unit, number, separator, time_ns};
+use super::table::{Row, Table, is_missing, ns_per_unit, number, time_ns};
 use crate::SampleEye;
+use crate::cells::{cells, separator};
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Tobii, recognises, read };
@@ -184,13 +185,9 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
             if is_event && eye.is_left_out(&row) {
                 continue;
             }
-            match figure(&row, eye) {
-                Ok(Some((diameter, valid))) => {
-                    let sample = LogSample { t, eye: eye.eye, diameter, confidence: 1.0, aperture_mm: None, valid };
-                    log.push(sample, row.number);
-                }
-                Ok(None) => unmeasured += 1,
-                Err(fault) => log.count(fault),
+            match figure(&row, eye).transpose() {
+                Some(size) => log.push_sized(size, LogSample::lost(t, eye.eye), row.number),
+                None => unmeasured += 1,
             }
         }
     }
@@ -207,6 +204,7 @@ fn open(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Option<(Table, Col
     let Some(mut table) = Table::open(input, log, is_header)? else { return Ok(None) };
     let Some(columns) = Columns::of(&table) else { return Ok(None) };
     let eyes = columns.eyes.iter().flatten().flat_map(|eye| [Some(eye.diameter), eye.validity]);
+    table.look_for_headers(columns.time);
     let others = [Some(columns.time), columns.sensor, columns.event];
     let finer = FINER_TIMES.map(|wanted| table.column(|name| plain_name(name).0 == wanted));
     table.keep_to(eyes.chain(others).chain(columns.recording).chain(finer).flatten());
@@ -249,10 +247,10 @@ fn is_in_microseconds(mut table: Table, columns: &Columns) -> bool {
     usual_step(&times).is_some_and(|step| step > GREATEST_STEP_MS)
 }
 
-/// The diameter of an eye and whether the tracker saw it; None where it was not measured.
+/// The diameter of an eye, 0 where the tracker did not see it; None where it was not measured.
 ///
 /// Pro Lab says `Valid` or `Invalid`; Studio gives 0 (sure) to 4 (not found) and advises to use 0 and 1.
-fn figure(row: &Row<'_>, eye: &Eye) -> Result<Option<(f32, bool)>, LogFault> {
+fn figure(row: &Row<'_>, eye: &Eye) -> Result<Option<f64>, LogFault> {
     let validity = match eye.validity {
         None => None,
         Some(column) => match row.cell(column)? {
@@ -266,8 +264,8 @@ fn figure(row: &Row<'_>, eye: &Eye) -> Result<Option<(f32, bool)>, LogFault> {
     if is_missing(cell) {
         // Without a word on validity an empty cell is the only sign of a lost pupil.
         let lost = validity == Some(false) || eye.validity.is_none();
-        return Ok(lost.then_some((0.0, false)));
+        return Ok(lost.then_some(0.0));
     }
-    let diameter = number(cell)? as f32;
-    Ok(Some((diameter, validity != Some(false) && diameter > 0.0)))
+    let diameter = number(cell)?;
+    Ok(Some(if validity == Some(false) { 0.0 } else { diameter }))
 }

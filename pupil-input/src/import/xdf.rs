@@ -15,7 +15,9 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
+use super::size::{ARBITRARY, MILLIMETRES, Measure, PIXELS, Said, Unit};
 use super::table::ns_of;
+use super::text::share;
 use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 use crate::wire::WireFault;
@@ -241,19 +243,27 @@ impl Figure {
     }
 }
 
-/// How a figure becomes a diameter.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Measure {
-    Diameter,
-    Radius,
-    Area,
-}
-
 /// What a channel holds of a pupil.
 #[derive(Clone, Debug, PartialEq)]
 enum Channel {
-    Size { eye: SampleEye, measure: Measure, unit: SizeUnit, factor: f64 },
-    Confidence { eye: SampleEye },
+    Size {
+        eye: SampleEye,
+        measure: Measure,
+        unit: Unit,
+        /// For people.
+        label: String,
+        /// Why it may be another measure.
+        doubt: Option<&'static str>,
+    },
+    Confidence {
+        eye: SampleEye,
+        /// What makes a share of one of it.
+        factor: f64,
+    },
+    /// A length that is said to be in units of area.
+    Contradiction {
+        label: String,
+    },
     Other,
 }
 
@@ -345,50 +355,56 @@ fn child_text<'a>(node: Node<'a, '_>, name: &str) -> Option<&'a str> {
 /// What a channel holds, by its label, type, eye and unit
 /// (<https://github.com/sccn/xdf/wiki/Gaze-Meta-Data>, and what recorders write in fact).
 fn channel(node: Node<'_, '_>) -> Channel {
+    let written = child_text(node, "label").unwrap_or_default();
     let text = |name| child_text(node, name).unwrap_or_default().to_lowercase();
     let (label, kind, eye, unit) = (text("label"), text("type"), text("eye"), text("unit"));
     let says = |word: &str| label.contains(word) || kind.contains(word);
     let words: Vec<&str> = label.split(|letter: char| !letter.is_alphanumeric()).collect();
     let has_word = |word: &str| words.contains(&word);
-    let eye = match eye.as_str() {
-        "left" => SampleEye::Left,
-        "right" => SampleEye::Right,
-        "both" => SampleEye::Both,
-        _ if label.contains("left") || has_word("l") || has_word("diameter1") => SampleEye::Left,
-        _ if label.contains("right") || has_word("r") || has_word("diameter0") => SampleEye::Right,
+    // `PupilDiameterL`.
+    let ends_in = |letter: char| {
+        let before = written.strip_suffix(letter).and_then(|rest| rest.chars().next_back());
+        before.is_some_and(|before| before.is_lowercase() || before.is_ascii_digit())
+    };
+    let eye = match SampleEye::named(eye.as_bytes()) {
+        Some(eye) => eye,
+        _ if label.contains("left") || has_word("l") || has_word("diameter1") || ends_in('L') => SampleEye::Left,
+        _ if label.contains("right") || has_word("r") || has_word("diameter0") || ends_in('R') => SampleEye::Right,
         _ => SampleEye::Both,
     };
     if says("confidence") {
-        return Channel::Confidence { eye };
+        let factor = if matches!(unit.as_str(), "%" | "percent" | "per cent") { 0.01 } else { 1.0 };
+        return Channel::Confidence { eye, factor };
     }
     // The width and height of the pupil's picture.
     if matches!(kind.as_str(), "diameterx" | "diametery") {
         return Channel::Other;
     }
-    let measure = if says("diam") {
-        Measure::Diameter
-    } else if says("radius") && !says("sphere") && !says("eyeball") {
-        Measure::Radius
-    } else if says("area") && says("pupil") {
-        Measure::Area
-    } else if says("pupilsize") || says("pupil_size") || says("pupil size") || label == "pupil" || kind == "pupil" {
-        Measure::Diameter
-    } else {
-        return Channel::Other;
+    let said = Said {
+        diameter: says("diam"),
+        radius: !says("diam") && says("radius") && !says("sphere") && !says("eyeball"),
+        area: !says("diam") && !says("radius") && says("area") && says("pupil"),
     };
+    let is_size = says("pupilsize") || says("pupil_size") || says("pupil size") || label == "pupil" || kind == "pupil";
+    if said.only().is_none() && !is_size {
+        return Channel::Other;
+    }
     // A diameter of something else: the eyeball's, a fixation's circle.
     if !says("pupil") && !matches!(kind.as_str(), "diameter" | "radius") && !label.starts_with("diameter") {
         return Channel::Other;
     }
-    let (unit, factor) = match unit.trim_end_matches("^2").trim_end_matches('\u{b2}') {
-        "mm" | "millimeter" | "millimeters" | "millimetre" | "millimetres" => (SizeUnit::Millimetres, 1.0),
-        "m" | "meter" | "meters" | "metre" | "metres" => (SizeUnit::Millimetres, 1e3),
-        "px" | "pixel" | "pixels" => (SizeUnit::Pixels, 1.0),
-        "" if label.ends_with("_3d") || has_word("mm") => (SizeUnit::Millimetres, 1.0),
-        "" if label.ends_with("_2d") || has_word("px") => (SizeUnit::Pixels, 1.0),
-        _ => (SizeUnit::Arbitrary, 1.0),
+    let unit = match (Unit::named(&unit), unit.as_str()) {
+        (Some(unit), _) => unit,
+        (None, "") if label.ends_with("_3d") || has_word("mm") => MILLIMETRES,
+        (None, "") if label.ends_with("_2d") || has_word("px") => PIXELS,
+        _ => ARBITRARY,
     };
-    Channel::Size { eye, measure, unit, factor }
+    let label = written.to_owned();
+    if unit.is_squared && (said.diameter || said.radius) {
+        return Channel::Contradiction { label };
+    }
+    let (measure, doubt) = unit.measure(said, Said::default());
+    Channel::Size { eye, measure, unit, label, doubt }
 }
 
 /// Says of which channels the samples are taken: the best unit that there is, and of each eye the first of it. On
@@ -397,9 +413,23 @@ fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(
     let units = [SizeUnit::Millimetres, SizeUnit::Pixels, SizeUnit::Arbitrary];
     let has = |stream: &Stream, wanted: SizeUnit| {
         stream.figure != Figure::Text
-            && stream.channels.iter().any(|channel| matches!(channel, Channel::Size { unit, .. } if *unit == wanted))
+            && stream
+                .channels
+                .iter()
+                .any(|channel| matches!(channel, Channel::Size { unit, .. } if unit.unit == wanted))
     };
     let told = |stream: &Stream| format!("`{}` of type `{}`", stream.name.escape_debug(), stream.kind.escape_debug());
+    for stream in streams.values() {
+        for channel in &stream.channels {
+            if let Channel::Contradiction { label } = channel {
+                log.warn(format!(
+                    "the channel `{}` of the stream {} is left out: by its label it is a length, and its unit is one of area",
+                    label.escape_debug(),
+                    told(stream)
+                ));
+            }
+        }
+    }
     let Some(unit) = units.into_iter().find(|unit| streams.values().any(|stream| has(stream, *unit))) else {
         let names: Vec<_> = streams.values().take(20).map(told).collect();
         return Err(format!("no pupil among {} streams ({})", streams.len(), names.join(", ")));
@@ -411,21 +441,47 @@ fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(
     for id in order {
         let Some(stream) = streams.get_mut(&id) else { continue };
         let sizes = stream.channels.iter().enumerate().filter_map(|(index, channel)| match channel {
-            Channel::Size { eye, unit: of, .. } if *of == unit && stream.figure != Figure::Text => Some((*eye, index)),
+            Channel::Size { eye, unit: of, .. } if of.unit == unit && stream.figure != Figure::Text => {
+                Some((*eye, index))
+            }
             _ => None,
         });
+        let (mut doubts, mut doubles) = (Vec::new(), Vec::new());
         for (eye, size) in sizes {
+            let Channel::Size { label, measure, doubt, .. } = &stream.channels[size] else { continue };
+            let label = label.escape_debug().to_string();
             // Both eyes in one figure add nothing to an eye's own, and the other way round.
             let again = known
                 .iter()
                 .any(|&(of, by)| of == eye || by != id && (of == SampleEye::Both || eye == SampleEye::Both));
             if again {
+                if known.contains(&(eye, id)) {
+                    doubles.push((eye, label));
+                }
                 continue;
             }
+            if let Some(doubt) = doubt {
+                doubts.push((label, measure.plural(), *doubt));
+            }
             known.push((eye, id));
-            let confidence =
-                |wanted| stream.channels.iter().position(|channel| *channel == Channel::Confidence { eye: wanted });
+            let confidence = |wanted| {
+                stream
+                    .channels
+                    .iter()
+                    .position(|channel| matches!(channel, Channel::Confidence { eye, .. } if *eye == wanted))
+            };
             stream.taken.push((eye, size, confidence(eye).or_else(|| confidence(SampleEye::Both))));
+        }
+        for (label, what, doubt) in doubts {
+            log.warn(format!("the channel `{label}` of {} is taken for {what}, though {doubt}", told(stream)));
+        }
+        for (eye, label) in doubles {
+            let told = format!("the channel `{label}` of {} was left out: another one is of the", told(stream));
+            match eye {
+                // Which of the two eyes each is, no label says.
+                SampleEye::Both => log.warn(format!("{told} pupil, too, and neither says of which eye it is")),
+                eye => log.note(format!("{told} {eye} eye, too")),
+            }
         }
         if stream.taken.is_empty() {
             left_out.push(told(stream));
@@ -628,21 +684,26 @@ impl Stream {
         let bytes = self.figure.bytes();
         let figure = |index: usize| self.figure.read(&row[index * bytes..(index + 1) * bytes]);
         for &(eye, size, confidence) in &self.taken {
-            let Channel::Size { measure, factor, .. } = &self.channels[size] else { continue };
+            let Channel::Size { measure, unit, .. } = &self.channels[size] else { continue };
             let raw = figure(size);
             if raw.is_nan() && self.one_eye_a_sample {
                 continue;
             }
-            let diameter = match measure {
-                Measure::Diameter => raw,
-                Measure::Radius => 2.0 * raw,
-                Measure::Area => 2.0 * (raw / std::f64::consts::PI).sqrt(),
-            };
-            let diameter = (diameter * factor) as f32;
+            let diameter = (unit.factor * measure.diameter(raw)) as f32;
             // NaN, 0 and -1 are what recorders write of a pupil that was not found.
             let valid = diameter.is_finite() && diameter > 0.0;
-            let confidence = confidence.map_or(1.0, |index| figure(index) as f32);
-            let confidence = if confidence.is_nan() { 0.0 } else { confidence.clamp(0.0, 1.0) };
+            let confidence = match confidence.map(|index| (&self.channels[index], figure(index))) {
+                None => 1.0,
+                Some((_, figure)) if figure.is_nan() => 0.0,
+                Some((Channel::Confidence { factor, .. }, figure)) => match share(factor * figure) {
+                    Ok(confidence) => confidence,
+                    Err(fault) => {
+                        log.count(fault);
+                        continue;
+                    }
+                },
+                Some(_) => continue,
+            };
             let diameter = if valid { diameter } else { 0.0 };
             log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, record);
         }

@@ -113,7 +113,9 @@ impl Job {
     pub(super) fn figures(&self) -> Figures {
         match self {
             Self::Live { profile, .. } => profile.figures(),
-            Self::Replay { recording, .. } => recording.unit().into(),
+            Self::Replay { recording, .. } => {
+                Figures { recorded_scale: recording.recorded_scale(), ..recording.unit().into() }
+            }
             Self::Rerun { raw, .. } => Figures { recorded_scale: raw.recorded_scale(), ..raw.profile().figures() },
             Self::Mock { .. } => SizeUnit::Millimetres.into(),
         }

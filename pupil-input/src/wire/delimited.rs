@@ -6,6 +6,7 @@
 use super::checksum::{Checksum, ChecksumKind};
 use super::field::{Fields, Layout, Message, Raw};
 use super::{Decoder, WireEvent, WireFault};
+use crate::cells::unquoted;
 
 /// Bytes of the longest line that is read, without its ending.
 pub const MAX_LINE_BYTES: usize = 4096;
@@ -25,7 +26,7 @@ pub struct DelimitedSettings {
     pub prefix: Vec<u8>,
     /// A line that begins so is a comment.
     pub comment: Vec<u8>,
-    /// The names of the columns, where the wire need not tell them.
+    /// The names of all columns, where the wire need not tell them; a line that holds more is refused.
     pub columns: Vec<String>,
     /// The checksum in two or four hexadecimal digits behind the last `*`, and how many of the line's first bytes it
     /// leaves out.
@@ -90,8 +91,10 @@ struct Columns {
     wanted: Vec<Column>,
     /// The number, from 0, of each; None until a header has told it.
     numbers: Vec<Option<usize>>,
-    /// Columns that a line is split into.
+    /// Columns that a line is split into: all that have names, or those up to the last that is read.
     needed: usize,
+    /// Columns that have names, where any has: a line with more has decimal commas, or other columns.
+    names: Option<usize>,
     /// Beginning and end of each.
     spans: Box<[(u16, u16); MAX_COLUMNS]>,
     found: usize,
@@ -123,6 +126,7 @@ impl DelimitedDecoder {
             wanted,
             numbers,
             needed: 0,
+            names: Some(settings.columns.len()).filter(|names| (1..MAX_COLUMNS).contains(names)),
             spans: Box::new([(0, 0); MAX_COLUMNS]),
             found: 0,
         };
@@ -221,7 +225,10 @@ impl Rows {
                 Err(fault) => return on_event(WireEvent::Rejected(fault)),
             },
         };
-        self.columns.split(row, self.columns.needed);
+        let rest = self.columns.split(row, self.columns.needed);
+        if self.columns.names.is_some() && self.columns.holds_more(rest) {
+            return on_event(WireEvent::Rejected(WireFault::MoreFields));
+        }
         if let Err(fault) = self.fields.read(&Row { columns: &self.columns, line: row }, on_event) {
             on_event(WireEvent::Rejected(fault));
         }
@@ -245,11 +252,11 @@ impl LineChecksum {
 impl Columns {
     fn count_needed(&mut self) {
         let last = self.numbers.iter().flatten().max();
-        self.needed = last.map_or(0, |last| last + 1).min(MAX_COLUMNS);
+        self.needed = self.names.unwrap_or(0).max(last.map_or(0, |last| last + 1)).min(MAX_COLUMNS);
     }
 
-    /// Finds the columns of a line, `most` of them.
-    fn split(&mut self, line: &[u8], most: usize) {
+    /// Finds the columns of a line, `most` of them, and gives what is behind them.
+    fn split<'l>(&mut self, line: &'l [u8], most: usize) -> &'l [u8] {
         self.found = 0;
         let mut start = 0;
         while self.found < most {
@@ -257,7 +264,7 @@ impl Columns {
             let (skip, length) = match self.separator {
                 Separator::Byte(byte) => (0, rest.iter().position(|found| *found == byte).unwrap_or(rest.len())),
                 Separator::Whitespace => {
-                    let Some(skip) = rest.iter().position(|byte| !is_blank(*byte)) else { return };
+                    let Some(skip) = rest.iter().position(|byte| !is_blank(*byte)) else { return &[] };
                     let length = rest[skip..].iter().position(|byte| is_blank(*byte));
                     (skip, length.unwrap_or(rest.len() - skip))
                 }
@@ -268,10 +275,17 @@ impl Columns {
             self.spans[self.found] = (begin as u16, end as u16);
             self.found += 1;
             if end == line.len() {
-                return;
+                return &[];
             }
             start = end + 1;
         }
+        &line[start..]
+    }
+
+    /// Whether what is behind the columns of a line holds anything but separators.
+    fn holds_more(&self, rest: &[u8]) -> bool {
+        let is_nothing = |byte: &u8| byte.is_ascii_whitespace() || self.separator == Separator::Byte(*byte);
+        !rest.iter().all(is_nothing)
     }
 
     fn cell<'a>(&self, line: &'a [u8], index: usize) -> Option<&'a [u8]> {
@@ -295,6 +309,7 @@ impl Columns {
         if !self.wanted.iter().all(|column| place(self, column).is_some()) {
             return false;
         }
+        self.names = Some(self.found).filter(|names| *names < MAX_COLUMNS);
         for index in 0..self.wanted.len() {
             self.numbers[index] = place(self, &self.wanted[index]);
         }
@@ -321,11 +336,6 @@ impl Columns {
 
 const fn is_blank(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t')
-}
-
-fn unquoted(cell: &[u8]) -> &[u8] {
-    let cell = cell.trim_ascii();
-    cell.strip_prefix(b"\"").and_then(|cell| cell.strip_suffix(b"\"")).unwrap_or(cell)
 }
 
 /// A line and its columns.
@@ -571,7 +581,29 @@ mod tests {
         assert_eq!(read, [unknown, WireEvent::Note, left(5, 4.0), WireEvent::Note, left(6, 4.0)]);
         // With names in the profile no header need come, and one that comes is no fault.
         settings.columns = ["time", "left"].map(str::to_owned).to_vec();
-        assert_eq!(decode(&settings, "5,3,4\ntime,left\n6,4\n"), [left(5, 3.0), WireEvent::Note, left(6, 4.0)]);
+        assert_eq!(decode(&settings, "5,3\ntime,left\n6,4\n"), [left(5, 3.0), WireEvent::Note, left(6, 4.0)]);
+    }
+
+    #[test]
+    fn a_row_of_more_cells_than_names_is_refused() {
+        let more = WireEvent::Rejected(WireFault::MoreFields);
+        // Decimal commas, and a column more.
+        let named = DelimitedSettings { columns: ["ms", "left", "right"].map(str::to_owned).to_vec(), ..settings() };
+        for row in ["10,3,7,3,4\n", "10,3,75,3,40\n", "10,1,3.7,3.4\n", "10,3.7,3.4,,5\n"] {
+            assert_eq!(decode(&named, row), [more], "{row}");
+        }
+        let both = [left(10, 3.5), right(10, 3.25)];
+        for row in ["10,3.5,3.25\n", "10,3.5,3.25,\r\n", "10,3.5,3.25, ,\n"] {
+            assert_eq!(decode(&named, row), both, "{row}");
+        }
+        let blanks = DelimitedSettings { separator: Separator::Whitespace, ..named };
+        assert_eq!(decode(&blanks, "10 3.5 3.25 \t\n10 3.5 3.25 1\n"), [both[0], both[1], more]);
+        // By the names of a header, of which the last ones are not read; without any, nothing is known.
+        let mut by_header = one_eye();
+        by_header.layout.pupils[0].size.at = Column::Name("left".into());
+        let text = "time,left,x\n10,3.5,1\n10,3,5,1\ntime,left,x,y\n10,3.5,1,1\n";
+        assert_eq!(decode(&by_header, text), [WireEvent::Note, left(10, 3.5), more, WireEvent::Note, left(10, 3.5)]);
+        assert_eq!(decode(&settings(), "10,3.5,3.25,1\n"), both);
     }
 
     #[test]

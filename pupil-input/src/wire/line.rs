@@ -177,12 +177,8 @@ fn read_line(line: &[u8]) -> Result<(LineSample, Option<WireFault>), WireFault> 
     let mut field = || fields.next().ok_or(WireFault::Malformed);
     let sequence = field()?.parse().map_err(|_| WireFault::BadNumber)?;
     let device_us = field()?.parse().map_err(|_| WireFault::BadNumber)?;
-    let eye = match field()? {
-        "L" => SampleEye::Left,
-        "R" => SampleEye::Right,
-        "B" => SampleEye::Both,
-        _ => return Err(WireFault::BadEye),
-    };
+    let eye = field()?;
+    let eye = SampleEye::ALL.into_iter().find(|known| eye.chars().eq([known.letter()])).ok_or(WireFault::BadEye)?;
     let diameter_mm: f32 = field()?.parse().map_err(|_| WireFault::BadNumber)?;
     let confidence: f32 = field()?.parse().map_err(|_| WireFault::BadNumber)?;
     let fault = if !diameter_mm.is_finite() || !confidence.is_finite() {

@@ -56,87 +56,47 @@ pub struct WireSample {
     pub valid: bool,
 }
 
-/// Why bytes were rejected.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum WireFault {
-    /// Longer than any message of the format.
-    TooLong,
-    /// Shorter than a message of the format.
-    TooShort,
-    /// Not of the format's form.
-    Malformed,
-    /// A version of the format that is not known.
-    UnknownVersion,
-    /// The checksum is missing or does not match.
-    BadChecksum,
-    /// A field is not a number.
-    BadNumber,
-    /// The eye is none that the format knows.
-    BadEye,
-    /// A figure is NaN or infinite.
-    NotFinite,
-    /// The size is negative, and that is not the format's word for a lost pupil.
-    Negative,
-    /// The confidence lies outside its range.
-    BadConfidence,
-    /// A field that a sample needs is not there.
-    MissingField,
-    /// Bytes between two messages that belong to neither.
-    OutOfStep,
-    /// It tells of more views, of another eye or camera, than the profile has.
-    MoreViews,
-    /// The pupil is seen, and has no size in millimetres: the tracker was not calibrated.
-    Uncalibrated,
+crate::named::named! {
+    /// Why bytes were rejected.
+    pub enum WireFault {
+        /// Longer than any message of the format.
+        TooLong = "wire_too_long",
+        /// Shorter than a message of the format.
+        TooShort = "wire_too_short",
+        /// Not of the format's form.
+        Malformed = "wire_malformed",
+        /// A version of the format that is not known.
+        UnknownVersion = "wire_unknown_version",
+        /// The checksum is missing or does not match.
+        BadChecksum = "wire_bad_checksum",
+        /// A field is not a number.
+        BadNumber = "wire_bad_number",
+        /// The eye is none that the format knows.
+        BadEye = "wire_bad_eye",
+        /// A figure is NaN or infinite.
+        NotFinite = "wire_not_finite",
+        /// The size is negative, and that is not the format's word for a lost pupil.
+        Negative = "wire_negative",
+        /// The confidence lies outside its range.
+        BadConfidence = "wire_bad_confidence",
+        /// A field that a sample needs is not there.
+        MissingField = "wire_missing_field",
+        /// Bytes between two messages that belong to neither.
+        OutOfStep = "wire_out_of_step",
+        /// It tells of more views, of another eye or camera, than the profile has.
+        MoreViews = "wire_more_views",
+        /// The pupil is seen, and has no size in millimetres: the tracker was not calibrated.
+        Uncalibrated = "wire_uncalibrated",
+        /// A figure behind the last column that has a name.
+        MoreFields = "wire_more_fields",
+    }
 }
 
 impl WireFault {
-    /// Every reason, in the order of their indices.
-    pub const ALL: [Self; 14] = [
-        Self::TooLong,
-        Self::TooShort,
-        Self::Malformed,
-        Self::UnknownVersion,
-        Self::BadChecksum,
-        Self::BadNumber,
-        Self::BadEye,
-        Self::NotFinite,
-        Self::Negative,
-        Self::BadConfidence,
-        Self::MissingField,
-        Self::OutOfStep,
-        Self::MoreViews,
-        Self::Uncalibrated,
-    ];
-
-    /// Its place in [`Self::ALL`].
-    pub const fn index(self) -> usize {
-        self as usize
-    }
-
     /// Whether a pupil's figure is no size, as some trackers send through a blink: a lost sample is told beside it, but
     /// of the first two by PupilEXT and LiveTrack, so that its neighbours are not believed.
     pub(crate) const fn is_of_a_figure(self) -> bool {
         matches!(self, Self::NotFinite | Self::Negative | Self::Uncalibrated)
-    }
-
-    /// The name under which it is counted.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::TooLong => "wire_too_long",
-            Self::TooShort => "wire_too_short",
-            Self::Malformed => "wire_malformed",
-            Self::UnknownVersion => "wire_unknown_version",
-            Self::BadChecksum => "wire_bad_checksum",
-            Self::BadNumber => "wire_bad_number",
-            Self::BadEye => "wire_bad_eye",
-            Self::NotFinite => "wire_not_finite",
-            Self::Negative => "wire_negative",
-            Self::BadConfidence => "wire_bad_confidence",
-            Self::MissingField => "wire_missing_field",
-            Self::OutOfStep => "wire_out_of_step",
-            Self::MoreViews => "wire_more_views",
-            Self::Uncalibrated => "wire_uncalibrated",
-        }
     }
 }
 

@@ -108,10 +108,11 @@ fn each_bad_cell_is_counted_by_its_reason() {
     assert_eq!(faults.of(LogFault::BadNumber), 2);
     assert_eq!(faults.of(LogFault::Malformed), 2);
     assert_eq!(faults.total(), 8);
-    // An empty cell or NaN with a time is an eye that is lost.
+    // An empty cell, NaN or no figure with a time is an eye that is lost.
+    let (left, right) = (SampleEye::Left, SampleEye::Right);
     let lost = recording.samples().filter(|sample| !sample.valid).map(|sample| (sample.t_sample.0, sample.eye));
-    assert_eq!(lost.collect::<Vec<_>>(), [(15, SampleEye::Right), (25, SampleEye::Right)]);
-    let left: Vec<_> = recording.samples().filter(|s| s.eye == SampleEye::Left).map(|s| s.diameter_mm).collect();
+    assert_eq!(lost.collect::<Vec<_>>(), [(15, right), (20, left), (20, right), (25, left), (25, right)]);
+    let left: Vec<_> = recording.samples().filter(|s| s.valid && s.eye == left).map(|s| s.diameter_mm).collect();
     assert_eq!(left, [3.6, 3.6, 3.5]);
 }
 
@@ -150,11 +151,19 @@ fn what_a_log_says_of_a_lost_eye_is_a_lost_sample_and_guards_its_neighbours() {
         assert_eq!(recording.format(), format);
         recording
     };
-    for lost in ["nan", "NaN", "-nan", "n/a", "null", "0"] {
+    // What no log says of a lost eye is a fault besides.
+    let faults = [("inf", LogFault::NotFinite), ("4.0.1", LogFault::BadNumber), ("#N/A", LogFault::BadNumber)];
+    let words = ["nan", "NaN", "-nan", "n/a", "null", "0"];
+    for (lost, fault) in
+        words.map(|word| (word, None)).into_iter().chain(faults.map(|(cell, fault)| (cell, Some(fault))))
+    {
         for log in logs_with(lost) {
             let format = log.0;
             let recording = read(log);
-            assert_eq!((recording.len(), recording.faults().total()), (300, 0), "{format}, {lost}");
+            let faults = recording.faults();
+            let expected = if fault.is_some() { 20 } else { 0 };
+            assert_eq!((recording.len(), faults.total()), (300, expected), "{format}, {lost}");
+            assert_eq!(fault.map_or(0, |fault| faults.of(fault)), expected, "{format}, {lost}");
             let valid: Vec<_> = recording.samples().map(|sample| sample.valid).collect();
             assert!(valid.iter().enumerate().all(|(k, valid)| *valid != (100..120).contains(&k)), "{format}, {lost}");
             let mut rejected = Vec::new();
@@ -171,13 +180,152 @@ fn what_a_log_says_of_a_lost_eye_is_a_lost_sample_and_guards_its_neighbours() {
             assert_eq!(rejected, (95..130).collect::<Vec<_>>(), "{format}, {lost}");
         }
     }
-    // What no log says of a lost eye is a fault, as before.
-    for (lost, fault) in [("inf", LogFault::NotFinite), ("4.0.1", LogFault::BadNumber)] {
-        for log in logs_with(lost) {
-            let recording = read(log);
-            assert_eq!((recording.len(), recording.faults().of(fault)), (280, 20), "{lost}");
+}
+
+#[test]
+fn a_row_of_more_cells_than_names_is_not_read() {
+    let dir = TempDir::new().expect("a folder");
+    for (format, text) in logs_with("3,7") {
+        if format == LogFormat::EyeLink {
+            continue;
+        }
+        // Of SMI, whose cells are set apart by tabs, a cell more.
+        let text = if format == LogFormat::Smi { text.replace("3,7", "3.7\t3.5") } else { text };
+        let (recording, info) = info(&written(&dir, "log", text));
+        assert_eq!((recording.len(), recording.faults().of(LogFault::Malformed)), (280, 20), "{format}");
+        assert!(recording.samples().all(|sample| sample.diameter_mm == 4.0), "{format}");
+        let told = "20 rows hold more cells than there are names of columns, the first in line 1";
+        assert!(info.notes[0].contains(told) && info.notes[0].contains("decimal commas"), "{:?}", info.notes);
+    }
+    // What is empty tells nothing, and a text of PupilEXT's user may hold commas.
+    let (_, neon) = logs_with("4.0,,\"\"").into_iter().next().expect("logs");
+    let row = |k: i64| format!("x,{},PuRe,40,41,3.5,go, now\n", 1000 + 5 * k);
+    let header = "filename,timestamp_ms,algorithm,diameter_px,undistortedDiameter_px,physicalDiameter_mm,message\n";
+    let pupilext = header.to_owned() + &(0..300).map(row).collect::<String>();
+    for text in [neon, pupilext] {
+        let (recording, info) = info(&written(&dir, "log", text));
+        assert_eq!((recording.len(), recording.faults().total()), (300, 0), "{:?}", info.notes);
+    }
+    // Nothing else is in it.
+    let all = "timestamp [ns],pupil diameter left [mm]\n1000000,3,7\n6000000,3,7\n";
+    let error = Recording::read(&written(&dir, "log", all)).expect_err("no sample").to_string();
+    assert!(error.contains("log_malformed 2") && error.contains("more cells than there are names"), "{error}");
+}
+
+#[test]
+fn a_header_that_comes_again_is_none_but_of_other_columns_ends_the_log() {
+    type Row = fn(i64) -> String;
+    let logs: [(LogFormat, &str, &str, Row); 6] = [
+        (
+            LogFormat::NeonEyeStates,
+            "timestamp [ns],pupil diameter left [mm],pupil diameter right [mm]",
+            "timestamp [ns],worn,pupil diameter left [mm],pupil diameter right [mm]",
+            |t_ms| format!("{t_ms}000000,3.5,3.6"),
+        ),
+        (
+            LogFormat::Core,
+            "pupil_timestamp,eye_id,confidence,norm_pos_x,diameter,method,diameter_3d",
+            "eye_id,pupil_timestamp,confidence,norm_pos_x,diameter,method,diameter_3d",
+            |t_ms| format!("{}.{:03},1,1,0,40,pye3d,3.5", t_ms / 1000, t_ms % 1000),
+        ),
+        (
+            LogFormat::Smi,
+            "Time\tType\tTrial\tL Pupil Diameter [mm]\tR Pupil Diameter [mm]",
+            "Time\tType\tTrial\tR Pupil Diameter [mm]\tL Pupil Diameter [mm]",
+            |t_ms| format!("{t_ms}000\tSMP\t1\t3.5\t3.6"),
+        ),
+        (
+            LogFormat::Tobii,
+            "Recording timestamp [ms]\tSensor\tPupil diameter left [mm]",
+            "Recording timestamp [ms]\tSensor\tGaze point X\tPupil diameter left [mm]",
+            |t_ms| format!("{t_ms}\tEye Tracker\t3.5"),
+        ),
+        (
+            LogFormat::Gazepoint,
+            "TIME(2020/11/03 12:00:00.000),LPMM,LPMMV",
+            "TIME(2020/11/03 12:00:00.000),LPMMV,LPMM",
+            |t_ms| format!("{}.{:03},3.5,1", t_ms / 1000, t_ms % 1000),
+        ),
+        (
+            LogFormat::PupilExt,
+            "filename,timestamp_ms,algorithm,diameter_px,physicalDiameter_mm",
+            "filename,timestamp_ms,algorithm,physicalDiameter_mm,diameter_px",
+            |t_ms| format!("x,{t_ms},PuRe,40,3.5"),
+        ),
+    ];
+    let dir = TempDir::new().expect("a folder");
+    for (format, header, other, row) in logs {
+        let part = |from: i64| (from..from + 100).map(|k| row(1000 + 5 * k) + "\n").collect::<String>();
+        let joined = |header_again: &str| format!("{header}\n{}{header_again}\n{}", part(0), part(100));
+        let alone = Recording::read(&written(&dir, "log", joined("").replace("\n\n", "\n"))).expect("reads");
+        assert_eq!(alone.format(), format);
+        // Of another recording.
+        let again = header.replace("12:00:00", "13:00:00");
+        let (recording, info) = info(&written(&dir, "log", joined(&again)));
+        assert_eq!((recording.len(), recording.faults().total()), (alone.len(), 0), "{format}");
+        assert!(info.notes.iter().any(|note| note.contains("its header comes again in line 102")), "{:?}", info.notes);
+        let error = Recording::read(&written(&dir, "log", joined(other))).expect_err("two tables").to_string();
+        assert!(error.contains(", line 102: found another header, of other columns"), "{format}: {error}");
+    }
+}
+
+/// Rows of Core's at 200 Hz: of each, whether there is one in the `k`th row.
+fn core_rows(rows: &[(&str, &str, fn(i64) -> bool)]) -> String {
+    let mut text = String::from("pupil_timestamp,eye_id,confidence,norm_pos_x,diameter,method,diameter_3d\n");
+    for k in 0..2000_i64 {
+        for (eye, method, there) in rows {
+            if there(k) {
+                let mm = if method.contains("3d") { "3.5" } else { "" };
+                writeln!(text, "{}.{:03},{eye},0.9,0,40,{method},{mm}", k / 200, k % 200 * 5)
+                    .expect("a String takes all");
+            }
         }
     }
+    text
+}
+
+#[test]
+fn core_keeps_the_best_rows_of_each_eye_and_tells_what_is_lost_by_that() {
+    let dir = TempDir::new().expect("a folder");
+    let (live, post_hoc) = ("pye3d 0.3.0 real-time", "pye3d 0.3.0 post-hoc");
+    let [left, right] = ["1", "0"];
+    let read = |rows: &[(&str, &str, fn(i64) -> bool)]| {
+        let (recording, info) = info(&written(&dir, "log", core_rows(rows)));
+        let of = |eye| recording.samples().filter(|sample| sample.eye == eye).count();
+        (recording.unit(), [SampleEye::Left, SampleEye::Right].map(of), recording.warnings().join("\n"), info.notes)
+    };
+    // A model that was fitted afterwards to the right eye alone.
+    let (unit, counts, warnings, notes) =
+        read(&[(left, live, |_| true), (right, live, |_| true), (right, post_hoc, |_| true)]);
+    assert_eq!((unit, counts, warnings.as_str()), (SizeUnit::Millimetres, [2000; 2], ""));
+    assert!(notes[0].contains("of the other eye, which has no such rows, of the live model"), "{notes:?}");
+    // The left one has no millimetres.
+    let (unit, counts, warnings, _) =
+        read(&[(left, "2d c++", |_| true), (right, live, |_| true), (right, "2d c++", |_| true)]);
+    assert_eq!((unit, counts), (SizeUnit::Millimetres, [0, 2000]));
+    assert!(warnings.contains("the left eye is left out: its 2000 rows are of 2-D detection"), "{warnings}");
+    // Millimetres come late.
+    let (unit, counts, warnings, _) = read(&[(left, "2d c++", |_| true), (left, live, |k| k >= 1800)]);
+    assert_eq!((unit, counts), (SizeUnit::Millimetres, [200, 0]));
+    assert!(warnings.contains("of the left eye's 10.0 s only 1.0 s were read"), "{warnings}");
+    let (_, counts, warnings, _) = read(&[(left, "2d c++", |_| true), (left, live, |k| k >= 20)]);
+    assert_eq!((counts, warnings.as_str()), ([1980, 0], ""));
+}
+
+#[test]
+fn confidence_in_per_cent_is_not_taken_for_certainty() {
+    let header = "pupil_timestamp,eye_id,confidence,norm_pos_x,diameter,method,diameter_3d\n";
+    let rows: String =
+        (0..100).map(|k| format!("1.{:03},1,{},0,40,pye3d,3.5\n", 5 * k, ["20", "0.9", "1.0000001"][k % 3])).collect();
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", format!("{header}{rows}")));
+    assert_eq!((recording.len(), recording.faults().of(LogFault::BadConfidence)), (66, 34));
+    assert!(recording.samples().all(|sample| sample.confidence == 0.9 || sample.confidence == 1.0));
+    assert!(
+        info.notes[0].contains("34 samples were left out") && info.notes[0].contains("per cent"),
+        "{:?}",
+        info.notes
+    );
 }
 
 #[test]
@@ -353,7 +501,8 @@ fn core_prefers_the_model_fitted_afterwards_and_reads_older_names() {
         recording.samples().map(|sample| (sample.t_sample.0, sample.eye, sample.diameter_mm, sample.valid)).collect();
     let expected = [
         (-1_500_000_000, SampleEye::Right, 3.2, true),
-        (-1_400_000_000, SampleEye::Right, 3.4, false),
+        (-1_400_000_000, SampleEye::Right, 0.0, false),
+        (-1_300_000_000, SampleEye::Left, 0.0, false),
         (-1_100_000_000, SampleEye::Left, 0.0, false),
     ];
     assert_eq!(read, expected);
@@ -457,8 +606,9 @@ fn eyelink_whole_milliseconds_at_2_khz_and_remote_columns_are_read() {
     let bad = "14\t  1.0\t  1.0\n15\t  1.0\t  1.0\t  -9.0\n1x\t  1.0\t  1.0\t  9.0\n16\t 1.0\t 1.0\tbig\n";
     let (recording, info) = info(&written(&dir, "log", format!("{header}{rows}{bad}")));
     let times: Vec<_> = recording.samples().map(|sample| sample.t_sample.0 / 500_000).collect();
-    assert_eq!(times, [20, 21, 22, 23, 24, 25, 26, 27]);
-    assert!(recording.samples().all(|sample| sample.diameter_mm == 900.0));
+    assert_eq!(times, [20, 21, 22, 23, 24, 25, 26, 27, 30, 32]);
+    assert!(recording.samples().take(8).all(|sample| sample.valid && sample.diameter_mm == 900.0));
+    assert!(recording.samples().skip(8).all(|sample| !sample.valid));
     let faults: Vec<_> = info.faults.iter().map(|fault| (fault.name, fault.count)).collect();
     assert_eq!(faults, [("log_malformed", 1), ("log_bad_number", 2), ("log_negative", 1)]);
 }
@@ -488,7 +638,8 @@ fn smi_in_pixels_gives_the_disc_of_the_ellipse_and_counts_bad_rows() {
     let (recording, info) = info(&written(&dir, "log", text));
     let read: Vec<_> = recording.samples().map(|s| (s.t_sample.0, s.eye, s.diameter_mm, s.valid)).collect();
     let (eye, lost) = (SampleEye::Right, false);
-    assert_eq!(read, [(1_000_000, eye, 20.0, true), (3_000_000, eye, 0.0, lost), (7_000_000, eye, 0.0, lost)]);
+    assert_eq!(read[0], (1_000_000, eye, 20.0, true));
+    assert_eq!(read[1..], [3_000_000, 5_000_000, 6_000_000, 7_000_000].map(|t_ns| (t_ns, eye, 0.0, lost)));
     assert_eq!(recording.unit(), SizeUnit::Pixels);
     let faults: Vec<_> = info.faults.iter().map(|fault| (fault.name, fault.count)).collect();
     assert_eq!(faults, [("log_malformed", 1), ("log_bad_number", 2), ("log_negative", 1)]);

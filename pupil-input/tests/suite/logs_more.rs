@@ -142,7 +142,7 @@ fn tobii_studio_reads_with_its_names_and_validity_codes() {
     let recording = read(format!("{header}{rows}"));
     assert_eq!(
         of_eye(&recording, Left),
-        [(3 * MS, Some(2.8)), (19 * MS, Some(2.81)), (36 * MS, None)],
+        [(3 * MS, Some(2.8)), (19 * MS, Some(2.81)), (36 * MS, None), (53 * MS, None)],
         "{:?}",
         recording.notes()
     );
@@ -517,7 +517,12 @@ fn bids_reads_what_its_sidecar_says() {
     let recording = plain(sidecar, "20.5\nn/a\n\n21\nx\n").expect("reads");
     assert_eq!(
         samples(&recording),
-        [(-1500 * MS, Left, Some(20.5)), (-1498 * MS, Left, None), (-1496 * MS, Left, Some(21.0))]
+        [
+            (-1500 * MS, Left, Some(20.5)),
+            (-1498 * MS, Left, None),
+            (-1496 * MS, Left, Some(21.0)),
+            (-1494 * MS, Left, None)
+        ]
     );
     assert_eq!(recording.unit(), SizeUnit::Pixels);
     assert_eq!(recording.faults().of(LogFault::BadNumber), 1);
@@ -574,6 +579,85 @@ fn bids_areas_are_told_from_diameters_by_unit_then_name_then_description() {
         assert_eq!(noted(&recording, "areas were made diameters"), is_area);
         let of_mm = unit.starts_with("mm");
         assert_eq!(recording.unit() == SizeUnit::Millimetres, of_mm, "{unit}: {:?}", recording.unit());
+    }
+}
+
+#[test]
+fn bids_radii_are_told_by_name_or_description() {
+    for (column, description, expected_mm, doubted) in [
+        ("pupil_radius", "", 3.7, false),
+        ("pupil_size", "Radius of the pupil", 3.7, false),
+        ("pupil_diameter", "Radius of the pupil", 1.85, true),
+        ("pupil_size", "Diameter, from the fitted circle's radius", 1.85, false),
+    ] {
+        let sidecar = format!(
+            r#"{{"Columns": ["timestamp", "{column}"], "SamplingFrequency": 500, "RecordedEye": "left",
+                "timestamp": {{"Units": "ms"}}, "{column}": {{"Units": "mm", "Description": "{description}"}}}}"#
+        );
+        let recording = bids(&[("x_physio.tsv", b"0\t1.85\n2\t1.85\n"), ("x_physio.json", sidecar.as_bytes())]);
+        let recording = recording.expect("reads");
+        let read_mm = recording.samples().next().expect("a sample").diameter_mm;
+        assert!((read_mm - expected_mm).abs() < 1e-6, "{column}, {description}: {read_mm}");
+        assert_eq!(!recording.warnings().is_empty(), doubted, "{column}, {description}: {:?}", recording.notes());
+    }
+}
+
+#[test]
+fn bids_rows_of_more_cells_than_columns_are_not_read() {
+    // As pandas writes a table with its index.
+    let rows: String = (0..50).map(|k| format!("{k}\t{}\t100\t1\t3.7\n", 2 * k)).collect();
+    let error = bids(&[("x_physio.tsv", rows.as_bytes()), ("x_physio.json", SIDECAR.as_bytes())]).expect_err("refused");
+    let error = error.to_string();
+    assert!(error.contains("log_malformed 50") && error.contains("a column without a name"), "{error}");
+}
+
+#[test]
+fn bids_times_that_fit_no_unit_by_the_stated_rate_are_told() {
+    // Seconds at 1 kHz, with the rate of before a resampling, and of a clock of 10 kHz.
+    for (step, told) in [("0.001", true), ("20", false)] {
+        let step_of: f64 = step.parse().expect("a number");
+        let rows: String = (0..50).map(|k| format!("{:.3}\t3.7\n", f64::from(k) * step_of)).collect();
+        let sidecar = r#"{"Columns": ["timestamp", "pupil_size"], "SamplingFrequency": 500, "RecordedEye": "left", "pupil_size": {"Units": "mm"}}"#;
+        let recording = bids(&[("x_physio.tsv", rows.as_bytes()), ("x_physio.json", sidecar.as_bytes())]);
+        let recording = recording.expect("reads");
+        let warned = recording.warnings().join("\n");
+        assert_eq!(
+            warned.contains("is that frequency right?") && warned.contains(step),
+            told,
+            "{:?}",
+            recording.notes()
+        );
+    }
+}
+
+#[test]
+fn a_bids_eye_that_is_left_out_is_told() {
+    let sidecar = |eye: &str, unit: &str| {
+        format!(
+            r#"{{"Columns": ["timestamp", "pupil_diameter"], "SamplingFrequency": 500, "RecordedEye": "{eye}",
+                "timestamp": {{"Units": "ms"}}, "pupil_diameter": {{"Units": "{unit}"}}}}"#
+        )
+    };
+    for (eye, unit, told) in [
+        ("right", "pixels", "the right eye is left out: `pupil_diameter` is in camera pixels"),
+        (
+            "left",
+            "mm",
+            "recording-eye2_physio.tsv was left out: by its sidecar it is of an eye that was read already (left)",
+        ),
+        ("right", "mm", ""),
+    ] {
+        let [first, second] = [sidecar("left", "mm"), sidecar(eye, unit)];
+        let recording = bids(&[
+            ("x_recording-eye1_physio.tsv", b"0\t3.5\n2\t3.5\n"),
+            ("x_recording-eye1_physio.json", first.as_bytes()),
+            ("x_recording-eye2_physio.tsv", b"0\t3.5\n2\t3.5\n"),
+            ("x_recording-eye2_physio.json", second.as_bytes()),
+        ]);
+        let recording = recording.expect("reads");
+        let warned = recording.warnings().join("\n");
+        assert!(warned.contains(told) && warned.is_empty() == told.is_empty(), "{warned}");
+        assert_eq!(recording.len(), if told.is_empty() { 4 } else { 2 });
     }
 }
 
@@ -737,6 +821,87 @@ fn xdf_of_pupil_capture_reads_each_eye_in_its_turn() {
         recording.notes()
     );
     assert_eq!(samples(&read(gzip(xdf(&relay())))), samples(&recording));
+}
+
+#[test]
+fn xdf_figures_are_what_unit_and_label_say() {
+    let area = std::f64::consts::PI * 1.5 * 1.5;
+    let cases = [
+        (["LeftPupilSize", "left", "PupilSize", "mm^2"], area, SizeUnit::Millimetres, ""),
+        (["LeftPupilSize", "left", "PupilSize", "mm\u{b2}"], area, SizeUnit::Millimetres, ""),
+        (["LeftPupilArea", "left", "PupilArea", "mm^2"], area, SizeUnit::Millimetres, ""),
+        (["LeftPupilSize", "left", "PupilSize", "px^2"], area, SizeUnit::Pixels, ""),
+        (["LeftPupilSize", "left", "PupilSize", "mm"], 3.0, SizeUnit::Millimetres, ""),
+        (["LeftPupilSize", "left", "PupilSize", "cm"], 0.3, SizeUnit::Millimetres, ""),
+        (["LeftPupilSize", "left", "PupilSize", "\u{b5}m"], 3000.0, SizeUnit::Millimetres, ""),
+        (["LeftPupilRadius", "left", "PupilRadius", "mm"], 1.5, SizeUnit::Millimetres, ""),
+        (
+            ["LeftPupilSize", "left", "PupilSize", ""],
+            3.0,
+            SizeUnit::Arbitrary,
+            "the channel `LeftPupilSize` of `tracker` of type `Gaze` is taken for diameters, though neither",
+        ),
+        (["LeftPupilSize", "left", "PupilSize", "px"], 3.0, SizeUnit::Pixels, "is taken for diameters, though neither"),
+        (["LeftPupilDiameter", "left", "Diameter", "a.u."], 3.0, SizeUnit::Arbitrary, ""),
+        (
+            ["LeftPupilArea", "left", "PupilArea", "mm"],
+            area,
+            SizeUnit::Millimetres,
+            "is taken for areas, though its name",
+        ),
+    ];
+    for (channel, figure, unit, told) in cases {
+        let rows = [(Some(1.0), &[figure][..]), (Some(1.01), &[figure][..])];
+        let recording =
+            read(xdf(&[stream_header(7, "tracker", "Gaze", 0.0, "double64", &[channel]), doubles(7, &rows)]));
+        let read_as = recording.samples().next().expect("a sample").diameter_mm;
+        assert!((read_as - 3.0).abs() < 1e-5, "{channel:?}: {read_as}");
+        assert_eq!(recording.unit(), unit, "{channel:?}");
+        let warned = recording.warnings().join("\n");
+        assert!(warned.contains(told) && warned.is_empty() == told.is_empty(), "{channel:?}: {warned}");
+    }
+    // A length in units of area is neither.
+    let channels =
+        [["LeftPupilDiameter", "left", "Diameter", "mm^2"], ["RightPupilDiameter", "right", "Diameter", "mm"]];
+    let rows = [(Some(1.0), &[area, 3.0][..])];
+    let recording = read(xdf(&[stream_header(7, "tracker", "Gaze", 0.0, "double64", &channels), doubles(7, &rows)]));
+    assert_eq!(samples(&recording), [(1000 * MS, Right, Some(3.0))]);
+    assert!(recording.warnings()[0].contains("`LeftPupilDiameter`"), "{:?}", recording.notes());
+}
+
+#[test]
+fn xdf_eyes_are_told_by_a_labels_last_letter_and_twins_without_one_are_told() {
+    let rows = [(Some(1.0), &[3.0, 3.5][..])];
+    let of = |labels: [&str; 2]| {
+        let channels = labels.map(|label| [label, "", "Diameter", "mm"]);
+        read(xdf(&[stream_header(7, "tracker", "Gaze", 0.0, "double64", &channels), doubles(7, &rows)]))
+    };
+    let recording = of(["PupilDiameterL", "PupilDiameterR"]);
+    assert_eq!(samples(&recording), [(1000 * MS, Left, Some(3.0)), (1000 * MS, Right, Some(3.5))]);
+    let recording = of(["Pupil diameter one", "Pupil diameter other"]);
+    assert_eq!(samples(&recording), [(1000 * MS, Both, Some(3.0))]);
+    let told = "the channel `Pupil diameter other` of `tracker` of type `Gaze` was left out";
+    assert!(recording.warnings()[0].contains(told), "{:?}", recording.notes());
+}
+
+#[test]
+fn xdf_confidence_in_per_cent_is_divided_where_it_says_so_and_refused_where_it_does_not() {
+    for (unit, figure, expected) in [
+        ("percent", 20.0, Some(0.2)),
+        ("%", 100.0, Some(1.0)),
+        ("", 0.25, Some(0.25)),
+        ("", 20.0, None),
+        ("%", 130.0, None),
+    ] {
+        let channels =
+            [["LeftPupilDiameter", "left", "Diameter", "mm"], ["LeftConfidence", "left", "Confidence", unit]];
+        let rows = [(Some(1.0), &[3.0, 0.0][..]), (Some(1.01), &[3.0, figure][..])];
+        let recording =
+            read(xdf(&[stream_header(7, "tracker", "Gaze", 0.0, "double64", &channels), doubles(7, &rows)]));
+        let read_as = recording.samples().nth(1).map(|sample| sample.confidence);
+        assert_eq!(read_as, expected, "{figure} {unit}");
+        assert_eq!(recording.faults().of(LogFault::BadConfidence), u64::from(expected.is_none()));
+    }
 }
 
 #[test]

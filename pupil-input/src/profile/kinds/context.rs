@@ -8,8 +8,10 @@ use crate::size_unit::SizeUnit;
 use crate::wire::field::SizeRule;
 
 /// The eyes, as profiles name them.
-pub(in crate::profile) const EYES: [(&str, SampleEye); 3] =
-    [("left", SampleEye::Left), ("right", SampleEye::Right), ("both", SampleEye::Both)];
+pub(in crate::profile) const EYES: [(&str, SampleEye); 3] = {
+    let [left, right, both] = SampleEye::ALL;
+    [(left.name(), left), (right.name(), right), (both.name(), both)]
+};
 
 /// What the rest of the profile says about the figures on the wire.
 pub(in crate::profile) struct Context {
