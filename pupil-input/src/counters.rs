@@ -162,8 +162,9 @@ impl CounterSnapshot {
     /// Lost samples that were told beside the faults of their figures: as many as there can be. Of an eye that is not
     /// followed there are faults alone.
     pub(crate) fn lost_beside_faults(&self) -> u64 {
-        let of_figures = WireFault::ALL.into_iter().filter(|fault| fault.is_of_a_figure());
-        of_figures.map(|fault| self.fault(LogFault::Wire(fault))).sum::<u64>().min(self.rejected(Rejection::Lost))
+        let of_wires = WireFault::ALL.into_iter().filter(|fault| fault.is_of_a_figure()).map(LogFault::Wire);
+        let of_logs = [LogFault::NotFinite, LogFault::Negative, LogFault::BadNumber, LogFault::Missing];
+        of_wires.chain(of_logs).map(|fault| self.fault(fault)).sum::<u64>().min(self.rejected(Rejection::Lost))
     }
 
     /// Samples, lines and cells that were of no use, each counted once.
@@ -206,6 +207,9 @@ mod tests {
         counters.add_rejected(Rejection::Lost);
         counters.add_fault(LogFault::Wire(WireFault::Negative), 1);
         assert_eq!(counters.snapshot().refused_in_all(), 9, "one pupil, lost beside its fault");
+        counters.add_rejected(Rejection::Lost);
+        counters.add_fault(LogFault::Negative, 1);
+        assert_eq!(counters.snapshot().refused_in_all(), 10, "the same of a log");
         for (index, counter) in Counter::ALL.into_iter().enumerate() {
             assert_eq!(counter as usize, index);
         }

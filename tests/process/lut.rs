@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 use std::fs;
 
 use holod_tests::daemon::run;
-use holod_tests::small_rig;
+use holod_tests::{small_rig, worst};
 
 use crate::HOLOD;
 
@@ -27,7 +27,7 @@ fn most_off(table: &str, sign: f64) -> f64 {
         assert_eq!(named.parse::<usize>().unwrap(), level);
         (found.parse::<f64>().unwrap() - sign * phase_rad(level as u16)).abs()
     };
-    rows.iter().enumerate().map(off).fold(0.0, f64::max)
+    worst(rows.iter().enumerate().map(off))
 }
 
 #[test]

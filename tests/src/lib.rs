@@ -5,11 +5,14 @@ pub mod daemon;
 pub mod feed;
 pub mod frames;
 pub mod tracker;
+mod worst;
 
 use std::path::{Path, PathBuf};
 
 use rustix::fs::statvfs;
 use tempfile::TempDir;
+
+pub use worst::worst;
 
 /// A new folder in memory, or where there is little of that, on the disk: a disk that is busy with other work, such as
 /// what a build has written, holds status files and records up for minutes.

@@ -6,6 +6,7 @@ use holod_pupil_input::{
     Decision, Estimator, EstimatorSettings, GateSettings, MockSource, PupilEstimate, PupilSample, PupilState,
     Rejection, STATED_LAG, SampleEye, Scenario, Verdict,
 };
+use holod_tests::worst;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
@@ -84,13 +85,13 @@ fn a_ramp_is_followed_within_the_stated_lag() {
                 *mean_ms += (at(&estimator, t_ms).0 - truth(t_ms)) / -speed_mm_per_s * 1e3 / runs as f32;
             }
         }
-        let worst_from = |t_ms: usize| mean_behind_ms[t_ms / 5..].iter().copied().fold(0.0, f32::max);
+        let worst_from = |t_ms: usize| worst(mean_behind_ms[t_ms / 5..].iter().copied());
         let (worst_ms, later_ms) = (worst_from(2005), worst_from(2205));
         eprintln!(
             "ramp of {speed_mm_per_s} mm/s: {worst_ms:.1} ms behind, {later_ms:.1} ms from 200 ms after its onset"
         );
         assert!(worst_ms > 30.0, "nothing is known before the gate's lead is over: {worst_ms}");
-        assert!(f64::from(worst_ms) * 1e-3 < STATED_LAG.seconds(), "{worst_ms}");
+        assert!(worst_ms * 1e-3 < STATED_LAG.seconds(), "{worst_ms}");
         assert!(later_ms < 30.0, "{later_ms}");
     }
 }
@@ -110,10 +111,10 @@ fn the_error_on_a_made_up_eye_is_small() {
             let settled = || trace.iter().filter(|row| row.0 > 1.0);
             let error = rms(settled().map(|row| row.2 - row.1));
             let tracking = settled().filter(|row| row.3 == PupilState::Tracking);
-            let worst = tracking.map(|row| (row.2 - row.1).abs()).fold(0.0, f32::max);
-            eprintln!("{:12} rms {error:.3} mm, worst while tracking {worst:.3} mm", scenario.name());
+            let greatest = worst(tracking.map(|row| (row.2 - row.1).abs()));
+            eprintln!("{:12} rms {error:.3} mm, worst while tracking {greatest:.3} mm", scenario.name());
             assert!(error < rms_mm, "{}: {error}", scenario.name());
-            assert!(worst < worst_mm, "{}: {worst}", scenario.name());
+            assert!(greatest < worst_mm, "{}: {greatest}", scenario.name());
         }
     }
 }
@@ -161,7 +162,7 @@ fn a_loss_is_held_then_slides_to_the_fallback_and_back() {
         assert_eq!(state == PupilState::Tracking, mm > 4.91, "{state:?} at {mm} mm, {t_ms} ms");
         shown.push(mm);
     }
-    let fastest = shown.windows(2).map(|pair| (pair[1] - pair[0]).abs() / 5e-3).fold(0.0, f32::max);
+    let fastest = worst(shown.windows(2).map(|pair| (pair[1] - pair[0]).abs() / 5e-3));
     assert!(fastest < 5.5, "{fastest} mm/s");
     assert_eq!(at(&estimator, 11_495), (5.0, PupilState::Tracking));
 }
@@ -248,7 +249,7 @@ fn the_better_eye_is_shown_and_a_change_of_eye_slides() {
     let changed = from(3000).find(|row| row.1 < 3.99).expect("the eye is changed").0;
     assert!((3100..4500).contains(&changed), "{changed}");
     assert!(from(changed + 200).all(|row| (row.1 - 3.5).abs() < 1e-3));
-    let fastest = shown.windows(2).skip(100).map(|pair| (pair[1].1 - pair[0].1).abs() / 5e-3).fold(0.0, f32::max);
+    let fastest = worst(shown.windows(2).skip(100).map(|pair| (pair[1].1 - pair[0].1).abs() / 5e-3));
     assert!(fastest < 5.5, "{fastest} mm/s");
 }
 
@@ -272,7 +273,7 @@ fn another_eye_by_order_is_slid_to_and_every_sample_is_decided_upon() {
     let from = |t_ms: i64| shown.iter().filter(move |row| row.0 >= t_ms);
     assert!(from(500).take_while(|row| row.0 < 2000).all(|row| (row.1 - 4.0).abs() < 1e-3));
     assert!(from(2300).all(|row| (row.1 - 3.4).abs() < 1e-3 && row.2 == PupilState::Tracking));
-    let fastest = shown.windows(2).skip(100).map(|pair| (pair[1].1 - pair[0].1).abs() / 5e-3).fold(0.0, f32::max);
+    let fastest = worst(shown.windows(2).skip(100).map(|pair| (pair[1].1 - pair[0].1).abs() / 5e-3));
     assert!(fastest < 5.5, "{fastest} mm/s");
 }
 
@@ -292,7 +293,7 @@ fn shown_after_a_change(believed: bool, t_change_ms: i64, hold_ms: i64) -> Vec<(
         panic!("nothing is decided anew: {decision:?}")
     });
     shown.extend((t_change_ms..t_change_ms + 15_000).step_by(5).map(|t_ms| at(&estimator, t_ms)));
-    let fastest = shown.windows(2).map(|pair| (pair[1].0 - pair[0].0).abs() / 5e-3).fold(0.0, f32::max);
+    let fastest = worst(shown.windows(2).map(|pair| (pair[1].0 - pair[0].0).abs() / 5e-3));
     assert!(fastest < 5.5, "{fastest} mm/s after {t_change_ms} ms with {hold_ms} ms");
     assert_eq!(shown.last(), Some(&(5.0, PupilState::Fallback)));
     shown
@@ -592,8 +593,11 @@ fn a_return_with_samples_that_are_old_by_then_slides_from_what_is_shown() {
         let mut shown = Vec::new();
         push(1100, 3500, 2.0, late_ms, &mut shown);
         let jumps = shown.windows(2).map(|pair| (pair[1] - pair[0]).abs());
-        let greatest_mm = jumps.fold(0.0, f32::max);
+        let greatest_mm = worst(jumps);
         let most_mm = fastest_mm_per_s * 5e-3;
-        assert!(greatest_mm <= most_mm, "{late_ms} ms late, held for {hold_ms} ms: {greatest_mm} mm in 5 ms");
+        assert!(
+            greatest_mm <= f64::from(most_mm),
+            "{late_ms} ms late, held for {hold_ms} ms: {greatest_mm} mm in 5 ms"
+        );
     }
 }

@@ -10,6 +10,7 @@ use flate2::write::GzEncoder;
 use holod_calibration::TimeNs;
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::{Blink, LogFault, LogFormat, LogInfo, Recording, ReplayError, SampleEye, SizeUnit};
+use holod_tests::worst;
 use proptest::prelude::*;
 use tempfile::TempDir;
 
@@ -971,7 +972,7 @@ fn worst_time_s(recording: &Recording) -> f64 {
         let k = ((f64::from(sample.1.expect("seen")) - 3.0) * 1e4).round();
         (sample.0 as f64 * 1e-9 - 10_000.0 - 0.1 * k).abs()
     };
-    of_eye(recording, Left).into_iter().map(error_s).fold(0.0, f64::max)
+    worst(of_eye(recording, Left).into_iter().map(error_s))
 }
 
 #[test]
