@@ -269,8 +269,11 @@ fn a_header_that_comes_again_is_none_but_of_other_columns_ends_the_log() {
     }
 }
 
-/// Rows of Core's at 200 Hz: of each, whether there is one in the `k`th row.
-fn core_rows(rows: &[(&str, &str, fn(i64) -> bool)]) -> String {
+/// Eye and method of rows of Core's, and at which of its times there is one.
+type CoreRows = (&'static str, &'static str, fn(i64) -> bool);
+
+/// Ten seconds of Core's at 200 Hz.
+fn core_rows(rows: &[CoreRows]) -> String {
     let mut text = String::from("pupil_timestamp,eye_id,confidence,norm_pos_x,diameter,method,diameter_3d\n");
     for k in 0..2000_i64 {
         for (eye, method, there) in rows {
@@ -289,7 +292,7 @@ fn core_keeps_the_best_rows_of_each_eye_and_tells_what_is_lost_by_that() {
     let dir = TempDir::new().expect("a folder");
     let (live, post_hoc) = ("pye3d 0.3.0 real-time", "pye3d 0.3.0 post-hoc");
     let [left, right] = ["1", "0"];
-    let read = |rows: &[(&str, &str, fn(i64) -> bool)]| {
+    let read = |rows: &[CoreRows]| {
         let (recording, info) = info(&written(&dir, "log", core_rows(rows)));
         let of = |eye| recording.samples().filter(|sample| sample.eye == eye).count();
         (recording.unit(), [SampleEye::Left, SampleEye::Right].map(of), recording.warnings().join("\n"), info.notes)

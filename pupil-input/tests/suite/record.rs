@@ -5,6 +5,8 @@ use std::io::Write as _;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use flate2::Compression;
+use flate2::write::GzEncoder;
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::line::{LineSample, encode_line};
 use holod_pupil_input::{
@@ -235,6 +237,15 @@ fn a_recording_is_played_with_the_scale_of_its_run() {
         assert_eq!(fs::read_to_string(&again).expect("reads") == samples, scale.is_none());
         fs::remove_file(again).expect("removes");
     }
+    // As a log, which a packed one is.
+    let packed = folder.path().join("tracker.holodraw.gz");
+    let mut gzip = GzEncoder::new(fs::File::create(&packed).expect("creates"), Compression::fast());
+    gzip.write_all(&fs::read(&raw).expect("reads")).expect("packs");
+    gzip.finish().expect("packs");
+    let files = RecordFiles { raw: None, samples: Some(folder.path().join("packed.csv")) };
+    let handle = begin(&format!("replay:{},speed=max", packed.display()), None, files);
+    assert_eq!(handle.control.figures().recorded_scale, Some(0.5));
+    assert!(handle.control.remarks().iter().any(|remark| remark.contains("is played with it")));
 }
 
 #[test]
