@@ -338,19 +338,23 @@ impl Part {
         let ns = 1e9 / (rate_hz * ticks);
         // A unit of time where it is near one, any rate of ticks otherwise.
         let near = [1e9, 1e6, 1e3, 1.0].into_iter().find(|unit| (0.8..1.25).contains(&(ns / unit)));
-        if stated.is_none() && near.is_none() && !is_power_of_ten(ns) {
+        let is_doubtful = stated.is_none() && near.is_none() && !is_power_of_ten(ns);
+        let ns = near.unwrap_or(ns);
+        let path = self.path.display();
+        if is_doubtful {
+            // Rounded, as people would write them.
+            let (ticks, ns) = (ticks as f32, ns as f32);
             log.warn(format!(
-                "{}: its times have no unit, and by the `SamplingFrequency` of {rate_hz} Hz one is {ns} ns, which is none: is \
-                 that frequency right? The usual step of `{name}` is {ticks}; give it its \"Units\", such as \"s\" or \"ms\"",
-                self.path.display()
+                "{path}: its times have no unit, and by the `SamplingFrequency` of {rate_hz} Hz one is {ns} ns, which is none: \
+                 is that frequency right? The usual step of `{name}` is {ticks}; give it its \"Units\", such as \"s\" or \
+                 \"ms\""
+            ));
+        } else {
+            let stated = stated.map_or("no unit".into(), |unit| format!("the unit `{}`", unit.escape_debug()));
+            log.note(format!(
+                "{path}: its times have {stated}; by the sampling frequency of {rate_hz} Hz one is {ns} ns"
             ));
         }
-        let ns = near.unwrap_or(ns);
-        let stated = stated.map_or("no unit".into(), |unit| format!("the unit `{}`", unit.escape_debug()));
-        log.note(format!(
-            "{}: its times have {stated}; by the sampling frequency of {rate_hz} Hz one is {ns} ns",
-            self.path.display()
-        ));
         Ok(ns)
     }
 

@@ -55,6 +55,8 @@ pub(crate) struct LogBuilder {
     /// Lines or rows whose time could be read.
     times: u64,
     first_backwards: Option<u64>,
+    /// Samples that are lost because their size is none.
+    lost_by_faults: usize,
     /// Rows that hold more than the header names, and the line of the first.
     wide: Option<(u64, u64)>,
     /// Lines in which the header came again, and that of one that names other columns.
@@ -93,6 +95,7 @@ impl LogBuilder {
             Err(fault) => {
                 self.count(fault);
                 if fault != LogFault::Malformed {
+                    self.lost_by_faults += 1;
                     self.push(lost, line);
                 }
             }
@@ -255,7 +258,8 @@ impl LogBuilder {
             let line = self.first_backwards.unwrap_or(0);
             return Err(ReplayError::Unsorted { path: path.into(), backwards, rows: self.times, line });
         }
-        if self.rows.is_empty() {
+        // Where nothing but faults made its samples, it holds none.
+        if self.rows.len() <= self.lost_by_faults && self.rows.iter().all(|row| !row.valid) {
             let reasons = self.faults.entries().filter(|(_, count)| *count > 0);
             let reasons: Vec<_> = reasons.map(|(name, count)| format!("{name} {count}")).collect();
             let why = match self.faults.total() {

@@ -473,7 +473,11 @@ fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(
             stream.taken.push((eye, size, confidence(eye).or_else(|| confidence(SampleEye::Both))));
         }
         for (label, what, doubt) in doubts {
-            log.warn(format!("the channel `{label}` of {} is taken for {what}, though {doubt}", told(stream)));
+            log.warn(format!(
+                "the channel `{label}` of {} is taken for {what}, though {doubt}; where it is not, let its sender give it a \
+                 label that says diameter or area, or a unit such as mm^2",
+                told(stream)
+            ));
         }
         for (eye, label) in doubles {
             let told = format!("the channel `{label}` of {} was left out: another one is of the", told(stream));

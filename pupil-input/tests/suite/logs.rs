@@ -183,6 +183,17 @@ fn what_a_log_says_of_a_lost_eye_is_a_lost_sample_and_guards_its_neighbours() {
 }
 
 #[test]
+fn a_log_of_nothing_but_faults_holds_no_sample() {
+    let dir = TempDir::new().expect("a folder");
+    // PupilEXT's has pixels besides.
+    for (_, log) in logs_with("4.0").into_iter().filter(|log| log.0 != LogFormat::PupilExt) {
+        let log = log.replace("4.0", "#N/A");
+        let error = Recording::read(&written(&dir, "log", log)).expect_err("no sample").to_string();
+        assert!(error.contains("holds no sample") && error.contains("log_bad_number 300"), "{error}");
+    }
+}
+
+#[test]
 fn a_row_of_more_cells_than_names_is_not_read() {
     let dir = TempDir::new().expect("a folder");
     for (format, text) in logs_with("3,7") {
