@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,25 @@ import torch
 
 from holod_training.config import OpticsConfig
 from holod_training.export import check_folder, load_weights, weights_sha256, write_beside
-from holod_training.judging import AFTER, OURS, Bench, Judged, judge_scenes, network_method, open_alike, rivals
+from holod_training.goals import bench_checks, right_pupil_margins_db
+from holod_training.judging import (
+    AFTER,
+    OURS,
+    Bench,
+    Judged,
+    check_alike,
+    judge_scenes,
+    network_method,
+    open_alike,
+    rivals,
+)
 from holod_training.metrics import SSIM_WINDOW_PX
 from holod_training.network import FieldNetwork
-from holod_training.shards import Shard, ShardError, check_border
+from holod_training.refocus import refocus_cards
+from holod_training.shards import Shard, ShardError, check_border, check_kind, open_held_out
 
 RIVAL = "smooth phase"
+CONTRASTS = {"dark on bright": "dark marks", "bright on dark": "bright marks"}
 LINE = 100
 
 
@@ -28,9 +42,11 @@ def across_benches(
     border_px: int,
     limit: int | None,
     device: torch.device | str = "cpu",
+    card_folders: Sequence[Path] = (),
 ) -> str:
-    """Judges every weights file on every folder's bench; writes benches.md and benches.json into `out`, and returns the
-    Markdown. Raises ConfigError, ShardError, WeightsError, JudgementError."""
+    """Judges every weights file on every folder's bench, and on the refocus cards in the folder of `card_folders` that
+    has the same name; writes benches.md and benches.json into `out`, and returns the Markdown. Raises ConfigError,
+    ShardError, WeightsError, JudgementError."""
     check_folder(out)
     networks = {path.stem: load_weights(path).to(device) for path in weights}
     if len(networks) < len(weights):
@@ -41,8 +57,12 @@ def across_benches(
     benches = [(folder.name, open_alike(folder, limit)) for folder in folders]
     for _, shards in benches:
         check_border(shards, border_px, "--border-px", SSIM_WINDOW_PX)
+    cards = _open_cards(card_folders, {name: shards[0].optics for name, shards in benches}, border_px)
     judged = {
-        name: {key: _judge(key, network, shards, border_px, device) for key, network in networks.items()}
+        name: {
+            key: _judge(key, network, shards, cards.get(name, []), border_px, device)
+            for key, network in networks.items()
+        }
         for name, shards in benches
     }
     result = {
@@ -71,24 +91,59 @@ def _outside(networks: dict[str, FieldNetwork], optics: OpticsConfig) -> list[st
     return [name for name, network in networks.items() if network.config.trained.outside(optics) > 1]
 
 
-def _judge(name: str, network: FieldNetwork, shards: list[Shard], border_px: int, device: torch.device | str) -> Judged:
-    """One network, which is called `OURS`, and the rival."""
+def _open_cards(folders: Sequence[Path], benches: dict[str, OpticsConfig], border_px: int) -> dict[str, list[Shard]]:
+    """By the name of the bench that they are for."""
+    cards: dict[str, list[Shard]] = {}
+    for folder in folders:
+        if folder.name in cards or folder.name not in benches:
+            raise ShardError(
+                f"--cards: found a folder named {folder.name!r}, expected the name of one of --test's, each once: "
+                f"{', '.join(benches)}"
+            )
+        shards = open_held_out(folder, benches[folder.name])
+        for shard in shards:
+            check_kind(shard, "cards")
+        check_alike(shards, ("size",), "with one `--size`")
+        check_border(shards, border_px, "--border-px")
+        cards[folder.name] = shards
+    return cards
+
+
+def _judge(
+    name: str,
+    network: FieldNetwork,
+    shards: list[Shard],
+    cards: list[Shard],
+    border_px: int,
+    device: torch.device | str,
+) -> tuple[Judged, list[dict[str, Any]]]:
+    """One network, which is called `OURS`, and the rival; and their refocus ratios."""
     optics = shards[0].optics
     bench = Bench(optics, network.config.amplitude_constant, border_px, device)
     methods = [network_method(OURS, network.on(optics)), *(one for one in rivals(optics) if one.name == RIVAL)]
     print(f"{name}, {len(shards)} scenes", flush=True)
-    return judge_scenes(shards, methods, bench)
+    refocus = refocus_cards(cards, methods, bench, pupils_mm=shards[0].pupils_mm) if cards else []
+    return judge_scenes(shards, methods, bench), refocus
 
 
-def _bench(name: str, shards: list[Shard], judged: dict[str, Judged]) -> dict[str, Any]:
+def _bench(name: str, shards: list[Shard], found: dict[str, tuple[Judged, list[dict[str, Any]]]]) -> dict[str, Any]:
     optics = shards[0].optics
+    judged = {key: of for key, (of, _) in found.items()}
+    first = next(iter(found))
+    refocus = [
+        {**row, "method": key if row["method"] == OURS else RIVAL}
+        for key, (_, of) in found.items()
+        for row in of
+        if row["method"] == OURS or key == first
+    ]
     rows = []
     for key, of in judged.items():
         rows += [
             {"method": key if row["method"] == OURS else RIVAL, **{k: v for k, v in row.items() if k != "method"}}
             for row in of.rows()
-            if row["double_phase"] == AFTER and (row["method"] == OURS or key == next(iter(judged)))
+            if row["double_phase"] == AFTER and (row["method"] == OURS or key == first)
         ]
+    matrix = {key: of.summary()["matrix_psnr_db"][AFTER] for key, of in judged.items()}
     return {
         "bench": name,
         "wavelengths_nm": optics.wavelengths_nm,
@@ -112,36 +167,74 @@ def _bench(name: str, shards: list[Shard], judged: dict[str, Judged]) -> dict[st
             ]
             for key, of in judged.items()
         },
-        "matrix_psnr_db": {key: of.summary()["matrix_psnr_db"][AFTER] for key, of in judged.items()},
+        "matrix_psnr_db": matrix,
+        "right_pupil_margin_db": {
+            key: [round(margin, 3) for margin in right_pupil_margins_db(of)] for key, of in matrix.items()
+        },
+        **({"refocus": refocus} if refocus else {}),
     }
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """A row for each bench and method; cells hold PSNR over all / in focus / slope at each pupil."""
+    """A row for each bench and method; cells hold PSNR over all / in focus / slope at each pupil. Then the goals."""
     about = (
         "After double phase and rounding to 8-bit levels: PSNR dB / in focus dB / slope, means over scenes; in "
-        f"brackets over {RIVAL}, dB over all / in focus, scene by scene. *Right pupil best*: of how many of the judged "
-        f"pupils. A border of {result['border_px']} px is left out."
+        f"brackets over {RIVAL}, dB over all / in focus, scene by scene. *Right pupil ahead*: by how many dB over all "
+        "a hologram for the judged pupil is ahead of the best one for another pupil of the table, for each judged one. "
+        "*Foam* in thousandths of white squared, less is better. *Refocus*: gradient energy of a card's fine marks in "
+        "focus over out of focus, the lesser of a near and a far card. Both at each pupil, as in the columns before. A "
+        f"border of {result['border_px']} px is left out."
     )
     lines = [textwrap.fill(about, LINE), ""]
     for bench in result["benches"]:
         pupils = bench["pupils_mm"]
-        lines += [
-            textwrap.fill(_about(bench), LINE),
-            "",
-            "| method | " + " | ".join(f"s = {mm:g} mm" for mm in pupils) + " | right pupil best |",
-            "|---|" + "---|" * (len(pupils) + 1),
+        contrasts = [contrast for contrast in CONTRASTS if _refocus(bench, None, contrast)]
+        labels = [
+            *("method", *(f"s = {mm:g} mm" for mm in pupils), "right pupil ahead, dB", "foam"),
+            *(f"refocus, {CONTRASTS[contrast]}" for contrast in contrasts),
         ]
-        methods = list(dict.fromkeys(row["method"] for row in bench["rows"]))
-        for method in methods:
+        lines += [textwrap.fill(_about(bench), LINE), "", f"| {' | '.join(labels)} |", "|---" * len(labels) + "|"]
+        for method in dict.fromkeys(row["method"] for row in bench["rows"]):
             rows = [row for row in bench["rows"] if row["method"] == method]
             gains = bench["gain_over_rival"].get(method)
-            cells = [_cell(row, gains[index] if gains else None) for index, row in enumerate(rows)]
-            lines.append(
-                f"| {method} | " + " | ".join([*cells, _right_pupil(bench["matrix_psnr_db"].get(method))]) + " |"
-            )
+            cells = [
+                method,
+                *(_cell(row, gains[index] if gains else None) for index, row in enumerate(rows)),
+                " / ".join(f"{margin:+.2f}" for margin in bench["right_pupil_margin_db"].get(method, [])),
+                " / ".join(_number(1e3 * row["foam"] if "foam" in row else None, ".2f") for row in rows),
+                *(" / ".join(f"{ratio:.2f}" for ratio in _refocus(bench, method, contrast)) for contrast in contrasts),
+            ]
+            lines.append(f"| {' | '.join(cells)} |")
         lines.append("")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_goals(result)])
+
+
+def _goals(result: dict[str, Any]) -> list[str]:
+    about = (
+        "The least of each bench's pupils, of refocus ratios also of its cards and marks, and what was wanted of it; "
+        "**bold** where that was not reached."
+    )
+    checks = [(bench["bench"], of, bench_checks(bench, of)) for bench in result["benches"] for of in _networks(bench)]
+    judged = dict.fromkeys(what for _, _, found in checks for what, _, _, _ in found)
+    labels = ["bench", "network", *judged]
+    lines = ["## Goals", "", textwrap.fill(about, LINE), "", f"| {' | '.join(labels)} |", "|---" * len(labels) + "|"]
+    for name, method, found in checks:
+        cells = {what: f"{value if met else f'**{value}**'} ({wanted})" for what, value, wanted, met in found}
+        lines.append(f"| {' | '.join([name, method, *(cells.get(what, '-') for what in judged)])} |")
+    return [*lines, ""]
+
+
+def _networks(bench: dict[str, Any]) -> list[str]:
+    return list(bench["gain_over_rival"])
+
+
+def _refocus(bench: dict[str, Any], method: str | None, contrast: str) -> list[float]:
+    """The lesser of the near and the far card's ratio, at each pupil; of any method where none is named."""
+    return [
+        min(row["near_card"], row["far_card"])
+        for row in bench.get("refocus", [])
+        if row["contrast"] == contrast and method in (None, row["method"])
+    ]
 
 
 def _about(bench: dict[str, Any]) -> str:
@@ -158,24 +251,16 @@ def _about(bench: dict[str, Any]) -> str:
     )
 
 
-def _cell(row: dict[str, Any], gain: dict[str, Any] | None) -> str:
-    def number(value: float | None, digits: str) -> str:
-        return "-" if value is None else f"{value:{digits}}"
+def _number(value: float | None, digits: str) -> str:
+    return "-" if value is None else f"{value:{digits}}"
 
+
+def _cell(row: dict[str, Any], gain: dict[str, Any] | None) -> str:
     cell = " / ".join(
-        number(row.get(key), digits)
+        _number(row.get(key), digits)
         for key, digits in (("psnr_db", ".1f"), ("psnr_in_focus_db", ".1f"), ("slope", ".2f"))
     )
     if gain is None:
         return cell
-    over = " / ".join(number(gain.get(key, {}).get("mean"), "+.1f") for key in ("psnr_db", "psnr_in_focus_db"))
+    over = " / ".join(_number(gain.get(key, {}).get("mean"), "+.1f") for key in ("psnr_db", "psnr_in_focus_db"))
     return f"{cell} ({over})"
-
-
-def _right_pupil(matrix: list[list[float]] | None) -> str:
-    """Of how many judged pupils (columns) the same given one has the most."""
-    if not matrix:
-        return ""
-    columns = list(zip(*matrix, strict=True))
-    right = sum(column[index] >= max(column) for index, column in enumerate(columns))
-    return f"{right} of {len(columns)}"

@@ -143,10 +143,18 @@ def _parser() -> argparse.ArgumentParser:
     across.add_argument(
         "--test", action="append", required=True, help="folder of held-out scenes, rendered for one bench; repeatable"
     )
+    across.add_argument(
+        "--cards", action="append", default=[], help="folder of refocus cards, named as that of --test; repeatable"
+    )
     across.add_argument("--out", required=True)
     across.add_argument("--border-px", type=int, default=judging.border_px, help="left out on every side")
     across.add_argument("--limit", type=int, help="only so many scenes")
     across.set_defaults(run=_across_benches)
+
+    about = "Writes the pages of an evaluation and of a table across benches again from their figures"
+    report = command("report", about, has_device=False)
+    report.add_argument("--folder", required=True, help="with evaluation.json, benches.json or both")
+    report.set_defaults(run=_report)
 
     eyebox = command("eyebox", "Shows where the light is in the pupil's plane, and how far an eye may move")
     eyebox.add_argument("--weights", required=True)
@@ -339,6 +347,14 @@ def _evaluate(options: argparse.Namespace) -> None:
     print(markdown(evaluate(config, choose_device(options.device))), end="")
 
 
+def _report(options: argparse.Namespace) -> None:
+    from holod_training import across_benches, report
+
+    pages = {"evaluation": report.markdown, "benches": across_benches.markdown}
+    for path in report.rewrite(Path(options.folder), pages):
+        print(path)
+
+
 def _eyebox(options: argparse.Namespace) -> None:
     from holod_training.eyebox import write_eyebox
 
@@ -397,9 +413,9 @@ _resolution.__name__ = "WxH"
 def _across_benches(options: argparse.Namespace) -> None:
     from holod_training.across_benches import across_benches
 
-    weights, folders = ([Path(path) for path in paths] for paths in (options.weights, options.test))
+    weights, folders, cards = ([Path(path) for path in of] for of in (options.weights, options.test, options.cards))
     device = choose_device(options.device)
-    print(across_benches(weights, folders, Path(options.out), options.border_px, options.limit, device))
+    print(across_benches(weights, folders, Path(options.out), options.border_px, options.limit, device, cards))
 
 
 def _bench_engines(options: argparse.Namespace) -> None:

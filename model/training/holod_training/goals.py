@@ -10,24 +10,28 @@ Check = tuple[str, str, str, bool]
 """(what, found, wanted, passed)."""
 
 GOALS = {
-    2.0: {"psnr_db": 30.0, "psnr_in_focus_db": 30.5, "slope": 0.50, "correlation": 0.75},
-    3.0: {"psnr_db": 28.2, "psnr_in_focus_db": 28.5, "slope": 0.42, "correlation": 0.68},
-    4.0: {"psnr_db": 26.8, "psnr_in_focus_db": 28.0, "slope": 0.35, "correlation": 0.62},
+    2.0: {"psnr_db": 27.3, "psnr_in_focus_db": 24.9, "slope": 0.50},
+    3.0: {"psnr_db": 26.0, "psnr_in_focus_db": 24.8, "slope": 0.47},
+    4.0: {"psnr_db": 25.1, "psnr_in_focus_db": 24.8, "slope": 0.43},
 }
-"""For 512x512."""
-PAPER_PSNR_DB = {2.0: 34.0, 3.0: 32.2, 4.0: 30.7}
-"""What the paper reports at 1920x1080 on scenes of its own."""
-PAPER_SIZE = [1080, 1920]
-OVER_FLAT_ORACLE_DB = 1.0
-DOUBLE_PHASE_DB = 0.3
-MATRIX_TOLERANCE_DB = 0.0
-CORNER_DB = 1.0
+"""Of `standard` on the default bench, on scenes of 256x256 at eleven focuses that it never saw."""
+GOALS_SIZE = [256, 256]
+BEHIND_DB = {"small": 0.15, "fast": 0.6}
+"""By how much other networks may be behind, over all and in focus."""
 REFOCUS_RATIO = 2.0
+LIGHT_RATIO = (0.8, 1.2)
+DARK_MEAN = 0.0005
+FOAM = {2.0: 0.00093, 3.0: 0.00133, 4.0: 0.00159}
+"""Half of what `standard-10` of the model card's recipe has on the card's scenes."""
+OVER_RIVAL_DB, OVER_RIVAL_WHERE_DIFFRACTION_IS_MORE_DB = 4.0, 3.0
+MORE_DIFFRACTION_PX2 = 100.0
+"""Green's λ·(f/p)²·V from which on the second of these is asked for: on the bench `gaea-40` alone."""
+BELOW_RIVAL_IN_FOCUS_DB = 0.2
+REFOCUS_RATIO_OF_ANY_BENCH = 1.8
 LABELS = {
     "psnr_db": "PSNR, dB,",
     "psnr_in_focus_db": "PSNR in focus, dB,",
     "slope": "slope",
-    "correlation": "correlation",
 }
 
 
@@ -67,8 +71,42 @@ def require_one_set_of_pupils(result: dict[str, Any]) -> None:
 
 
 def checks(result: dict[str, Any]) -> list[Check]:
-    """Every goal that the evaluation's pupils allow to judge."""
-    return [*_numbers(result), *_matrix(result), *_refocus(result)]
+    """Every goal that the evaluation's pupils, networks, cards and marks allow to judge."""
+    return [*_numbers(result), *_others(result), *_right_pupil(result), *_refocus(result), *_marks(result)]
+
+
+def right_pupil_margins_db(matrix: list[list[float]]) -> list[float]:
+    """For each judged pupil, the columns of PSNR(given, judged), by how much the same given one is ahead of the best
+    other; none of a single pupil."""
+    others = range(len(matrix))
+    return [
+        row[judged] - max(matrix[given][judged] for given in others if given != judged)
+        for judged, row in enumerate(matrix)
+        if len(matrix) > 1
+    ]
+
+
+def bench_checks(bench: dict[str, Any], method: str) -> list[Check]:
+    """The goals of one network on one bench of `across-benches`, each by the least of its pupils."""
+    over, in_focus = (
+        [gain[key]["mean"] for gain in bench["gain_over_rival"][method] if key in gain]
+        for key in ("psnr_db", "psnr_in_focus_db")
+    )
+    margins = right_pupil_margins_db(bench["matrix_psnr_db"][method])
+    ratios = [min(row["near_card"], row["far_card"]) for row in bench.get("refocus", []) if row["method"] == method]
+    diffracts = sorted(bench["volume_fresnel_px2"])[1] > MORE_DIFFRACTION_PX2
+    least = OVER_RIVAL_WHERE_DIFFRACTION_IS_MORE_DB if diffracts else OVER_RIVAL_DB
+    found = [
+        ("over smooth phase, dB", over, least, "+.2f"),
+        ("in focus over smooth phase, dB", in_focus, -BELOW_RIVAL_IN_FOCUS_DB, "+.2f"),
+        ("right pupil ahead by, dB", margins, 0.0, "+.2f"),
+        ("refocus ratio", ratios, REFOCUS_RATIO_OF_ANY_BENCH, ".2f"),
+    ]
+    return [
+        (what, f"{min(values):{digits}}", f"at least {wanted:g}", min(values) >= wanted)
+        for what, values, wanted, digits in found
+        if values
+    ]
 
 
 def _at_least(what: str, found: float, wanted: float) -> Check:
@@ -79,28 +117,32 @@ def _numbers(result: dict[str, Any]) -> Iterator[Check]:
     for pupil, wanted in GOALS.items():
         if pupil not in result["pupils_mm"]:
             continue
-        row, before = row_of(result, "holod", "after", pupil), row_of(result, "holod", "before", pupil)
+        row = row_of(result, "holod", "after", pupil)
         at = f"at s = {pupil:g} mm"
         for key, least in wanted.items():
             yield _at_least(f"{LABELS[key]} {at}", row.get(key, math.nan), least)
-        if result["size"] == PAPER_SIZE:
-            yield _at_least(f"the paper's PSNR, dB, {at}", row["psnr_db"], PAPER_PSNR_DB[pupil])
-        margin = row["psnr_db"] - row_of(result, "flat oracle", "before", pupil)["psnr_db"]
-        yield _at_least(f"over the flat oracle, dB, {at}", margin, OVER_FLAT_ORACLE_DB)
-        cost = before["psnr_db"] - row["psnr_db"]
-        yield f"double phase costs, dB, {at}", f"{cost:.3f}", f"at most {DOUBLE_PHASE_DB}", abs(cost) <= DOUBLE_PHASE_DB
+        if "foam" in row:
+            most = FOAM[pupil]
+            yield f"foam, thousandths, {at}", f"{1e3 * row['foam']:.2f}", f"at most {1e3 * most:g}", row["foam"] <= most
 
 
-def _matrix(result: dict[str, Any]) -> Iterator[Check]:
-    matrix, pupils = result["matrix_psnr_db"]["after"], result["pupils_mm"]
-    for column, pupil in enumerate(pupils):
-        behind = max(row[column] for row in matrix) - matrix[column][column]
-        what = f"right s behind the best, dB, judged s = {pupil:g} mm"
-        yield what, f"{behind:.3f}", f"at most {MATRIX_TOLERANCE_DB}", behind <= MATRIX_TOLERANCE_DB
-    last = len(pupils) - 1
-    for column in (0, last) if last else ():
-        margin = matrix[column][column] - matrix[last - column][column]
-        yield _at_least(f"right over opposite s, dB, judged s = {pupils[column]:g} mm", margin, CORNER_DB)
+def _others(result: dict[str, Any]) -> Iterator[Check]:
+    names = {row["method"] for row in result["networks"]}
+    for name, most in BEHIND_DB.items():
+        for pupil in GOALS:
+            if name not in names or pupil not in result["pupils_mm"]:
+                continue
+            ours, other = (row_of(result, method, "after", pupil) for method in ("holod", name))
+            for key, where in (("psnr_db", "over all"), ("psnr_in_focus_db", "in focus")):
+                behind = ours.get(key, math.nan) - other.get(key, math.nan)
+                what = f"{name} behind {where}, dB, at s = {pupil:g} mm"
+                yield what, f"{behind:.3f}", f"at most {most:g}", behind <= most
+
+
+def _right_pupil(result: dict[str, Any]) -> Iterator[Check]:
+    margins = right_pupil_margins_db(result["matrix_psnr_db"]["after"])
+    for pupil, margin in zip(result["pupils_mm"], margins, strict=False):
+        yield _at_least(f"right pupil ahead by, dB, judged s = {pupil:g} mm", margin, 0.0)
 
 
 def _refocus(result: dict[str, Any]) -> Iterator[Check]:
@@ -109,3 +151,18 @@ def _refocus(result: dict[str, Any]) -> Iterator[Check]:
             for card in ("near_card", "far_card"):
                 what = f"refocus ratio, {card.replace('_', ' ')}, {row['contrast']}, s = {row['pupil_mm']:g} mm"
                 yield _at_least(what, row[card], REFOCUS_RATIO)
+
+
+def _marks(result: dict[str, Any]) -> Iterator[Check]:
+    rows = [row for row in result.get("marks", []) if row["double_phase"] == "after"]
+    for method, marks in dict.fromkeys((row["method"], row["marks"]) for row in rows):
+        if method not in ("holod", *BEHIND_DB):
+            continue
+        of = [row for row in rows if (row["method"], row["marks"]) == (method, marks)]
+        pupils = [row["pupil_mm"] for row in of]
+        at = f"of {marks}, {method}, s = {min(pupils):g} to {max(pupils):g} mm"
+        light, (least, most) = [row["light_ratio"] for row in of], LIGHT_RATIO
+        within = least <= min(light) and max(light) <= most
+        yield f"light {at}", f"{min(light):.2f} to {max(light):.2f}", f"{least:g} to {most:g}", within
+        dark = max(row["dark_mean"] for row in of)
+        yield f"light on black {at}", f"{dark:.6f}", f"at most {DARK_MEAN:g}", dark <= DARK_MEAN

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,14 +46,20 @@ def card_areas(depth: Tensor, border_px: int) -> dict[str, Tensor]:
     return areas
 
 
-def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, sheet: Path) -> list[dict[str, Any]]:
-    """The ratio of every method that does not need a target, after double phase, at s = 1 to 5, means over the scenes
-    of each contrast; and a sheet of ours. Methods that are given focal stacks are judged at the pupils that all cards
-    have these for."""
+def refocus_cards(
+    shards: list[Shard],
+    methods: list[Method],
+    bench: Bench,
+    sheet: Path | None = None,
+    pupils_mm: Sequence[float] = PUPILS_MM,
+) -> list[dict[str, Any]]:
+    """The ratio of every method that does not need a target, after double phase, at these pupils, means over the scenes
+    of each contrast; and a sheet of ours, where it is named. Methods that are given focal stacks are judged at the
+    pupils that all cards have these for."""
     rows = []
     pictures = []
     focus = cards_dpt(bench.optics)
-    of_all = [pupil for pupil in PUPILS_MM if all(pupil in shard.pupils_mm for shard in shards)]
+    of_all = [pupil for pupil in pupils_mm if all(pupil in shard.pupils_mm for shard in shards)]
     for shard in shards:
         check_kind(shard, "cards")
         stack = bench.read(shard, 0)
@@ -63,7 +70,7 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
         line = [stack.image]
         for method in methods:
             panel = None
-            for pupil in of_all if method.takes_stack else PUPILS_MM:
+            for pupil in of_all if method.takes_stack else pupils_mm:
                 if panel is None or method.adapts:
                     given = shard.pupils_mm.index(pupil) if pupil in shard.pupils_mm else 0
                     field = method.field(bench.read(shard, given), pupil)
@@ -85,5 +92,6 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
                 if method.name == OURS and pupil in SHEET_PUPILS_MM:
                     line += [near_focus, far_focus]
         pictures.append(line)
-    save_sheet(sheet, pictures)
+    if sheet:
+        save_sheet(sheet, pictures)
     return means(rows, ("method", "contrast", "pupil_mm"))

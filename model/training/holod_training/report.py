@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
-from holod_training.goals import checks, find_row, require_one_set_of_pupils, row_of
+from holod_training.export import write_beside
+from holod_training.goals import GOALS_SIZE, ReportError, checks, find_row, require_one_set_of_pupils, row_of
 from holod_training.judging import PICTURES
 
 NUMBERS = (
@@ -33,6 +36,22 @@ def markdown(result: dict[str, Any]) -> str:
     require_one_set_of_pupils(result)
     parts = [_opening, _numbers, _paired, _matrix, _refocus, _marks, _costs, _double_phase, _plots, _goals]
     return "\n\n".join("\n".join(lines) for part in parts if (lines := part(result))) + "\n"
+
+
+def rewrite(folder: Path, pages: dict[str, Callable[[dict[str, Any]], str]]) -> list[Path]:
+    """Writes NAME.md from NAME.json for each of `pages` that is there; returns what was written. Raises ReportError."""
+    found = {name: path for name in pages if (path := folder / f"{name}.json").is_file()}
+    if not found:
+        raise ReportError(f"{folder}: found neither {' nor '.join(f'{name}.json' for name in pages)}")
+    written = []
+    for name, path in found.items():
+        try:
+            text = pages[name](json.loads(path.read_text()))
+        except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+            raise ReportError(f"{path}: no figures to report of ({error!r}); write them again") from error
+        write_beside(path.with_suffix(".md"), text.encode())
+        written.append(path.with_suffix(".md"))
+    return written
 
 
 def _opening(result: dict[str, Any]) -> list[str]:
@@ -207,8 +226,9 @@ def _plots(result: dict[str, Any]) -> list[str]:
 def _goals(result: dict[str, Any]) -> list[str]:
     size = result["size"]
     lines = ["## Goals", ""]
-    if size != [512, 512]:
-        lines += [f"The goals were set for 512x512; these scenes are {size[1]}x{size[0]}.", ""]
+    if size != GOALS_SIZE:
+        set_for = f"{GOALS_SIZE[1]}x{GOALS_SIZE[0]}"
+        lines += [f"The goals were set for {set_for}; these scenes are {size[1]}x{size[0]}.", ""]
     lines += _header(["what", "found", "wanted", ""])
     return lines + [
         _line([what, found, wanted, "yes" if ok else "**no**"]) for what, found, wanted, ok in checks(result)

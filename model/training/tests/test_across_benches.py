@@ -9,14 +9,19 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import write_shard
+from test_evaluate import write_card
 
 from holod_training.cli import main
 from holod_training.config import NetworkConfig
 from holod_training.export import load_weights, read_metadata, save_weights
-from holod_training.judging import Bench, network_field, open_alike
+from holod_training.goals import bench_checks, right_pupil_margins_db
+from holod_training.judging import Bench, network_field, network_method, open_alike
+from holod_training.refocus import refocus_cards
+from holod_training.shards import Shard
 from holod_training.variants import build_network
 
 TINY = NetworkConfig(layers=4, channels=4, adjustable_layers=(1,), modulation_hidden=4)
+PUPILS = (2.0, 4.0)
 SHIPPED = Path(__file__).parents[2] / "weights"
 GAEA = {"pixel_angle_rad": str(3.74e-6 / 40e-3), "pixel_pitch_um": "3.74", "wavelengths_nm": "[633.0, 532.0, 473.0]"}
 
@@ -74,7 +79,101 @@ def test_each_bench_has_a_row_for_each_network_and_one_for_the_rival(
     assert "**gaea-40**: 3.74 um, 40 mm, 633/532/473 nm, 0 to 2.86 dpt" in table
     assert "2 scenes of 64x64; outside what one, other were trained for" in " ".join(table.split())
     assert (default["outside_training"], gaea["outside_training"]) == ([], ["one", "other"])
-    assert table.count("| smooth phase | ") == 2 and table.count(" of 4 |") == 4
+    assert table.count("| smooth phase | ") == 2 and "refocus ratio |" not in table
+    for bench in found:
+        matrix = bench["matrix_psnr_db"]["one"]
+        others = max(matrix[given][1] for given in (0, 2, 3))
+        assert bench["right_pupil_margin_db"]["one"][1] == pytest.approx(matrix[1][1] - others, abs=2e-3)
+        (row,) = [line for line in table.splitlines() if line.startswith(f"| {bench['bench']} | one |")]
+        assert f"{min(bench['right_pupil_margin_db']['one']):+.2f}" in row.replace("*", "")
+
+
+def write_benches(tmp_path: Path) -> list[str]:
+    """One network, two benches with cards of both contrasts; the command without --cards."""
+    torch.manual_seed(1)
+    save_weights(tmp_path / "one.safetensors", build_network(TINY), {}, {})
+    command = ["across-benches", "--out", str(tmp_path / "out"), "--border-px", "8"]
+    command += ["--weights", str(tmp_path / "one.safetensors")]
+    for bench, metadata in (("default", {}), ("gaea-40", GAEA)):
+        write_shard(tmp_path / "test" / bench / "scene_000000.safetensors", pupils_mm=PUPILS, metadata=metadata)
+        for index in range(2):
+            write_card(tmp_path / "cards" / bench / f"scene_{index:06}.safetensors", index, metadata)
+        command += ["--test", str(tmp_path / "test" / bench)]
+    return command
+
+
+def test_refocus_ratios_are_of_each_bench_at_the_pupils_of_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = write_benches(tmp_path)
+    assert main([*command, "--cards", str(tmp_path / "cards" / "gaea-40")]) == 0
+    default, gaea = json.loads((tmp_path / "out" / "benches.json").read_text())["benches"]
+    assert "refocus" not in default
+    assert [row["pupil_mm"] for row in gaea["refocus"]] == [*PUPILS] * 4
+    cards = [Shard(tmp_path / "cards" / "gaea-40" / f"scene_{index:06}.safetensors") for index in range(2)]
+    network = load_weights(tmp_path / "one.safetensors").on(cards[0].optics)
+    bench = Bench(cards[0].optics, network.config.amplitude_constant, 8)
+    ours = refocus_cards(cards, [network_method("one", network)], bench, pupils_mm=PUPILS)
+    assert [row for row in gaea["refocus"] if row["method"] == "one"] == ours
+    assert {row["method"] for row in gaea["refocus"]} == {"one", "smooth phase"}
+    table = capsys.readouterr().out
+    tables, _, goals = table.partition("## Goals")
+    (head,) = [line for line in tables.splitlines() if "| refocus, dark marks | refocus, bright marks |" in line]
+    assert head.startswith("| method | s = 2 mm | s = 4 mm | right pupil ahead, dB | foam |")
+    dark = [min(row["near_card"], row["far_card"]) for row in ours if row["contrast"] == "dark on bright"]
+    assert f"| {dark[0]:.2f} / {dark[1]:.2f} |" in tables
+    least = min(min(row["near_card"], row["far_card"]) for row in ours)
+    cells = {line.split(" | ")[0]: line.split(" | ")[-1] for line in goals.splitlines() if " | one | " in line}
+    assert cells == {"| default": "- |", "| gaea-40": f"**{least:.2f}** (at least 1.8) |"} and least < 1.8
+
+
+def test_cards_of_no_bench_and_other_scenes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = write_benches(tmp_path)
+    cards = tmp_path / "cards"
+    (cards / "leto-40").mkdir()
+    for folders, message in (
+        ([cards / "leto-40"], "--cards: found a folder named 'leto-40', expected the name of one of --test's"),
+        ([cards / "default"] * 2, "--cards: found a folder named 'default', expected the name of one of --test's"),
+        ([tmp_path / "test" / "default"], "a scene of kind 'test', expected cards"),
+    ):
+        assert main([*command, *(word for folder in folders for word in ("--cards", str(folder)))]) == 65
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def bench_result(**changes: object) -> dict:
+    """What `across-benches` found of a network that reaches everything, with changes."""
+    gains = [{"psnr_db": {"mean": 4.5}, "psnr_in_focus_db": {"mean": 0.1}} for _ in range(2)]
+    ratios = {"method": "one", "contrast": "dark on bright", "pupil_mm": 2.0, "near_card": 1.9, "far_card": 2.4}
+    return {
+        "volume_fresnel_px2": [71.0, 60.0, 53.0],
+        "gain_over_rival": {"one": gains},
+        "matrix_psnr_db": {"one": [[27.0, 24.0], [26.0, 26.5]]},
+        "refocus": [ratios, {**ratios, "method": "smooth phase", "near_card": 1.1}],
+        **changes,
+    }
+
+
+def test_goals_of_a_bench_are_judged_by_the_least_of_its_pupils() -> None:
+    met = {what: (found, passed) for what, found, _, passed in bench_checks(bench_result(), "one")}
+    assert met == {
+        "over smooth phase, dB": ("+4.50", True),
+        "in focus over smooth phase, dB": ("+0.10", True),
+        "right pupil ahead by, dB": ("+1.00", True),
+        "refocus ratio": ("1.90", True),
+    }
+    for changes, missed in (
+        ({"gain_over_rival": {"one": [{"psnr_db": {"mean": 5.0}}, {"psnr_db": {"mean": 3.9}}]}}, "over smooth phase"),
+        ({"gain_over_rival": {"one": [{"psnr_in_focus_db": {"mean": -0.21}}]}}, "in focus over smooth phase"),
+        ({"matrix_psnr_db": {"one": [[27.0, 26.6], [26.0, 26.5]]}}, "right pupil ahead by"),
+        ({"refocus": [{"method": "one", "near_card": 1.9, "far_card": 1.79}]}, "refocus ratio"),
+    ):
+        found = bench_checks(bench_result(**changes), "one")
+        assert [what.partition(", dB")[0] for what, _, _, passed in found if not passed] == [missed]
+    diffracting = bench_result(volume_fresnel_px2=[209.0, 170.0, 147.0])
+    assert ("over smooth phase, dB", "+4.50", "at least 3", True) in bench_checks(diffracting, "one")
+    assert ("over smooth phase, dB", "+4.50", "at least 4", True) in bench_checks(bench_result(), "one")
+    assert right_pupil_margins_db([[27.0]]) == []
 
 
 def test_a_folder_without_scenes_is_said_before_the_long_work(tmp_path: Path) -> None:
