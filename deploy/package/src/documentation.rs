@@ -9,7 +9,7 @@ use std::path::{Component, Path, PathBuf};
 const INSTALLED: &str = "/usr/share/doc/holod";
 
 /// What is taken from the sources, a file or a folder with what lies in it, and its name among the documentation.
-const HELD: [(&str, &str); 19] = [
+const HELD: [(&str, &str); 20] = [
     ("README.md", "README.md"),
     ("deploy/README.md", "service.md"),
     ("calibration/doc", ""),
@@ -20,6 +20,7 @@ const HELD: [(&str, &str); 19] = [
     ("pupil-input/profiles", "examples/tracker-profiles"),
     ("calibration/profiles/lasers", "examples/laser-profiles"),
     ("model/weights/README.md", "weights.md"),
+    ("model/weights/recipe.md", "weights-recipe.md"),
     ("deploy/rigs/example.toml", "examples/rig.toml"),
     ("deploy/udev/60-holod-lasers.rules", "examples/udev/60-holod-lasers.rules"),
     ("deploy/udev/60-holod-tracker.rules", "examples/udev/60-holod-tracker.rules"),

@@ -350,7 +350,10 @@ def _evaluate(options: argparse.Namespace) -> None:
 def _report(options: argparse.Namespace) -> None:
     from holod_training import across_benches, report
 
-    pages = {"evaluation": report.markdown, "benches": across_benches.markdown}
+    pages: dict[str, Callable[[dict[str, Any]], str]] = {
+        "evaluation": report.markdown,
+        "benches": across_benches.markdown,
+    }
     for path in report.rewrite(Path(options.folder), pages):
         print(path)
 
