@@ -160,6 +160,7 @@ impl Pacer {
     /// The same of a frame for which there was nothing to be done: it says nothing of the time that frames take.
     pub fn submitted_at_once(&mut self, frame_id: u64, t_submit: TimeNs) {
         self.note_submission(frame_id, t_submit);
+        self.frame_times.rest(t_submit);
     }
 
     /// When it was to begin, at the first submission of a known frame.
@@ -314,6 +315,19 @@ impl FrameTimes {
     fn new(first: TimeNs) -> Self {
         let none = FrameTime { time: TimeNs(0), t_submit: TimeNs(0) };
         Self { window: [none; WINDOW], count: 0, estimate: first }
+    }
+
+    /// Frames took no work lately. Once all that is remembered is old, a hiccup among it must not slow them any more:
+    /// what they take is the median.
+    fn rest(&mut self, now: TimeNs) {
+        let known = self.count.min(WINDOW);
+        let is_old = |frame: &FrameTime| now.0.saturating_sub(frame.t_submit.0) > FORGOTTEN_AFTER.0;
+        if known == 0 || !self.window[..known].iter().all(is_old) {
+            return;
+        }
+        let mut times = self.window.map(|frame| frame.time);
+        times[..known].sort_unstable();
+        self.estimate = times[(known - 1) / 2];
     }
 
     fn push(&mut self, time: TimeNs, t_submit: TimeNs) {
@@ -620,6 +634,29 @@ mod tests {
         let plan = pacer.predict(now);
         pacer.submitted(plan.frame_id, plan.t_wake + TimeNs(3 * MS));
         assert_eq!(pacer.budget(), TimeNs(4 * MS), "a frame that was computed tells its time");
+    }
+
+    #[test]
+    fn a_hiccup_before_frames_that_take_no_work_is_forgotten_in_time() {
+        let mut pacer = Pacer::new(config(), TimeNs(0));
+        let mut now = TimeNs(MS);
+        for time_ms in [5, 6, 5, 40] {
+            let plan = pacer.predict(now);
+            now = plan.t_wake + TimeNs(time_ms * MS);
+            pacer.submitted(plan.frame_id, now);
+        }
+        let t_hiccup = now;
+        assert_eq!(pacer.budget(), TimeNs(41 * MS));
+        let mut frames = 0;
+        while pacer.budget() == TimeNs(41 * MS) && frames < 1000 {
+            let plan = pacer.predict(now);
+            now = plan.t_wake.max(now) + TimeNs(MS / 10);
+            pacer.submitted_at_once(plan.frame_id, now);
+            frames += 1;
+        }
+        assert!((TimeNs(0)..TimeNs(2 * REFRESH.0)).contains(&(now - t_hiccup - FORGOTTEN_AFTER)), "{now:?}");
+        assert!((60..70).contains(&frames), "every third refresh: {frames}");
+        assert_eq!(pacer.budget(), TimeNs(6 * MS));
     }
 
     #[test]
