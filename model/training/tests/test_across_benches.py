@@ -102,6 +102,7 @@ def write_benches(tmp_path: Path) -> list[str]:
     return command
 
 
+@torch.no_grad()
 def test_refocus_ratios_are_of_each_bench_at_the_pupils_of_the_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
