@@ -6,7 +6,7 @@ use holod_model::scene_shard::SceneKind;
 
 use super::random::{Random, mix, stream};
 
-/// Cards and marks of the shipped networks' recipe, `model/weights/README.md`: kind, seed and indices. They stay as they
+/// Cards and marks of the shipped networks' recipe, `model/weights/recipe.md`: kind, seed and indices. They stay as they
 /// were when these networks learnt from them and were judged on them.
 const RECIPE: [(SceneKind, u64, Range<u64>); 4] = [
     (SceneKind::Cards, 2, 1000..1080),
