@@ -7,6 +7,10 @@
 //! in the middle of a packet.
 //!
 //! Bytes are given as RTSP interleaves them, with the answer to `DESCRIBE` first, so that one decoder reads both.
+//!
+//! The phone's clock is asked four times a second by its Time Echo, and each answer given as a message of RTSP's form
+//! ([`time_message`]), so that a recording holds it too: the samples alone do not tell how long the phone and the network
+//! take for all of them. Between packets that come over TCP it would stand within one, so it is not asked there.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream, UdpSocket};
@@ -20,7 +24,7 @@ use serde_json::Value;
 use super::server::{OPEN_WITHIN, Server, ServerError, wait};
 use super::{ByteSource, Feed, READ_TIMEOUT, ReadEvent, SourceError};
 use crate::spec::HostPort;
-use crate::wire::neon::{MAX_TEXT_BYTES, gaze_media, header};
+use crate::wire::neon::{MAX_TEXT_BYTES, gaze_media, header, time_message};
 
 /// How long packets are waited for before the other transport is tried.
 const FIRST_PACKET_WITHIN: Duration = Duration::from_secs(3);
@@ -32,6 +36,9 @@ const SILENT_FOR: Duration = Duration::from_secs(2);
 const ANSWER_WITHIN: Duration = Duration::from_secs(5);
 /// Bytes of the longest status that is read; a Companion's has about 3000.
 const LONGEST_STATUS: usize = 1 << 18;
+const ASK_TIME_EACH: Duration = Duration::from_millis(250);
+/// The Time Echo is no need: a phone that does not open it soon is done without.
+const ECHO_OPENS_WITHIN: Duration = Duration::from_millis(500);
 /// Tries to find two free ports that follow each other.
 const PORT_TRIES: usize = 20;
 
@@ -89,10 +96,11 @@ impl Feed for NeonFeed {
     }
 }
 
-/// Where the gaze stream is.
+/// Where the gaze stream is, and the phone's Time Echo if it has one.
 struct GazeStream {
     address: SocketAddr,
     url: String,
+    time_echo: Option<SocketAddr>,
 }
 
 /// Asks for the Companion's status: a list of components, one of them the sensor `gaze` that is streamed directly.
@@ -124,7 +132,10 @@ fn find_stream(server: &Server<'_>, addresses: &[SocketAddr]) -> Result<GazeStre
     if params.bytes().any(|byte| !byte.is_ascii_graphic()) {
         return Err(server.unexpected(params.as_bytes(), "parameters that fit into a URL", NOT_UNDERSTOOD));
     }
-    Ok(GazeStream { address, url: format!("rtsp://{address}/?{params}") })
+    let echo_port = components.iter().find_map(|component| component["data"]["time_echo_port"].as_u64());
+    let echo_port = echo_port.and_then(|port| u16::try_from(port).ok()).filter(|port| *port > 0);
+    let time_echo = echo_port.map(|port| SocketAddr::new(host, port));
+    Ok(GazeStream { address, url: format!("rtsp://{address}/?{params}"), time_echo })
 }
 
 /// The whole answer to one HTTP request; the connection is closed behind it.
@@ -268,16 +279,84 @@ impl Rtsp {
     }
 }
 
+/// The phone's Time Echo: eight bytes, milliseconds big-endian, are answered with themselves and the phone's own.
+struct TimeEcho {
+    stream: TcpStream,
+    asked: Instant,
+    /// What it was asked with.
+    question: [u8; 8],
+    /// What has come of the answer, and how much.
+    answer: [u8; 16],
+    used: usize,
+}
+
+impl TimeEcho {
+    fn open(address: SocketAddr) -> io::Result<Self> {
+        let stream = TcpStream::connect_timeout(&address, ECHO_OPENS_WITHIN)?;
+        stream.set_nodelay(true)?;
+        stream.set_nonblocking(true)?;
+        let mut echo = Self { stream, asked: Instant::now(), question: [0; 8], answer: [0; 16], used: 0 };
+        echo.ask(echo.asked)?;
+        Ok(echo)
+    }
+
+    fn ask(&mut self, now: Instant) -> io::Result<()> {
+        let question = u64::from_be_bytes(self.question) + 1;
+        (self.question, self.asked, self.used) = (question.to_be_bytes(), now, 0);
+        self.stream.write_all(&self.question)
+    }
+
+    /// The phone's time in milliseconds, once for each question.
+    fn receive(&mut self, now: Instant) -> io::Result<Option<u64>> {
+        if self.used == self.answer.len() {
+            if now - self.asked >= ASK_TIME_EACH {
+                self.ask(now)?;
+            }
+            return Ok(None);
+        }
+        while self.used < self.answer.len() {
+            match receive(&mut self.stream, &mut self.answer[self.used..])? {
+                Some(count) => self.used += count,
+                None if now - self.asked >= ANSWER_WITHIN => return Err(ErrorKind::TimedOut.into()),
+                None => return Ok(None),
+            }
+        }
+        let [echoed, time] = [0, 8].map(|at| std::array::from_fn(|index| self.answer[at + index]));
+        Ok((echoed == self.question).then(|| u64::from_be_bytes(time)))
+    }
+}
+
 /// How the packets come.
 enum Transport {
     Datagrams { rtp: UdpSocket, rtcp: UdpSocket, sender: IpAddr },
     Interleaved,
 }
 
+/// What is known of the phone's clock.
+struct PhoneTime {
+    echo: Option<TimeEcho>,
+    /// A packet has come since a time was last given: times alone are no sign of a tracker that tracks.
+    heard: bool,
+}
+
+impl PhoneTime {
+    fn receive(&mut self, buffer: &mut [u8]) -> Option<usize> {
+        let outcome = self.echo.as_mut()?.receive(Instant::now());
+        if outcome.is_err() {
+            // The gaze stream does without it.
+            self.echo = None;
+        }
+        let time_ms = outcome.ok().flatten().filter(|_| self.heard)?;
+        self.heard = false;
+        time_message(time_ms, buffer)
+    }
+}
+
 struct NeonSource {
     rtsp: Rtsp,
     url: String,
     transport: Transport,
+    time: PhoneTime,
     /// What has been read and is to be given first.
     first: Vec<u8>,
     began: Instant,
@@ -332,11 +411,14 @@ impl NeonSource {
         if matches!(transport, Transport::Interleaved) {
             first.append(&mut rtsp.rest);
         }
+        let is_framed = matches!(transport, Transport::Datagrams { .. });
+        let echo = gaze.time_echo.filter(|_| is_framed).and_then(|address| TimeEcho::open(address).ok());
         let now = Instant::now();
         Ok(Self {
             rtsp,
             url: base,
             transport,
+            time: PhoneTime { echo, heard: false },
             first,
             began: now,
             heard: false,
@@ -355,6 +437,9 @@ impl NeonSource {
             return Ok(Some(count));
         }
         loop {
+            if let Some(count) = self.time.receive(buffer) {
+                return Ok(Some(count));
+            }
             let count = match &self.transport {
                 Transport::Interleaved => receive(&mut self.rtsp.stream, buffer)?,
                 Transport::Datagrams { rtp, rtcp, sender } => {
@@ -375,7 +460,7 @@ impl NeonSource {
                 if is_answer(&buffer[..count]) {
                     continue;
                 }
-                self.heard = true;
+                (self.heard, self.time.heard) = (true, true);
                 self.tries.unheard.store(0, Ordering::Relaxed);
                 return Ok(Some(count));
             }
@@ -402,7 +487,11 @@ impl NeonSource {
             let rtsp = self.rtsp.stream.as_fd();
             match &self.transport {
                 Transport::Interleaved => wait([rtsp], deadline)?,
-                Transport::Datagrams { rtp, rtcp, .. } => wait([rtsp, rtp.as_fd(), rtcp.as_fd()], deadline)?,
+                Transport::Datagrams { rtp, rtcp, .. } => {
+                    // Without a Time Echo, one of the others stands in its place.
+                    let echo = self.time.echo.as_ref().map_or(rtsp, |echo| echo.stream.as_fd());
+                    wait([rtsp, rtp.as_fd(), rtcp.as_fd(), echo], deadline)?;
+                }
             }
         }
     }

@@ -17,8 +17,12 @@
 //!
 //! RTCP's sender reports tie RTP time to Unix time (RFC 3550, 6.4.1): `t_device` is Unix time, as in Neon's own
 //! recordings, and `None` until the first report. Reports that disagree by less than [`CLOCK_STEP`] are taken in
-//! gently. `sequence` is RTP's number carried on over its 16 bits; a packet that was overtaken has none, as it leaves
+//! gently. The phone's own clock, where it was asked, comes in a message of RTSP's form with the header `Time-Echo`, in
+//! Unix milliseconds ([`time_message`]); one far from the newest packet's time is another clock, and passed over.
+//! `sequence` is RTP's number carried on over its 16 bits; a packet that was overtaken has none, as it leaves
 //! no gap.
+
+use std::io::Write;
 
 use holod_calibration::TimeNs;
 
@@ -29,6 +33,8 @@ use crate::SampleEye;
 pub(crate) const MAX_TEXT_BYTES: usize = 4096;
 /// Bytes of the longest packet. The gaze stream's have 101; after rubbish no more than this can be swallowed.
 const MAX_PACKET_BYTES: usize = 256;
+/// The phone's clock shows at most so much more than the newest packet does; what shows more, or less, is another one.
+const CLOCKS_ALIKE: i128 = 500_000_000;
 const FRAME_HEADER_BYTES: usize = 4;
 const RTP_HEADER_BYTES: usize = 12;
 /// Header and sender's part of a sender report.
@@ -97,7 +103,11 @@ impl NeonDecoder {
                 }
                 Front::Text(length) => {
                     self.step = Step::In;
-                    self.stream.read_text(&rest[..length]);
+                    match header(&rest[..length], TIME_ECHO).map(str::parse) {
+                        Some(Ok(time_ms)) => self.stream.read_time(time_ms).into_iter().for_each(&mut *on_event),
+                        Some(Err(_)) => on_event(WireEvent::Rejected(WireFault::BadNumber)),
+                        None => self.stream.read_text(&rest[..length]),
+                    }
                     at += length;
                 }
                 Front::Unknown | Front::Rubbish => {
@@ -134,6 +144,16 @@ impl Decoder for NeonDecoder {
     fn finish(&mut self, _on_event: &mut dyn FnMut(WireEvent)) {
         self.used = 0;
     }
+}
+
+const TIME_ECHO: &str = "time-echo";
+
+/// Writes a message that tells the phone's clock, in Unix milliseconds; none into a buffer that is too small.
+pub(crate) fn time_message(time_ms: u64, buffer: &mut [u8]) -> Option<usize> {
+    let room = buffer.len();
+    let mut rest = buffer;
+    write!(rest, "RTSP/1.0 200 OK\r\n{TIME_ECHO}: {time_ms}\r\n\r\n").ok()?;
+    Some(room - rest.len())
 }
 
 /// What `bytes` begin with.
@@ -219,6 +239,14 @@ impl Stream {
         if rate.is_some() {
             *self = Self { clock_rate: rate, ..Self::new() };
         }
+    }
+
+    /// The phone's clock, where it is the one that packets are timed by.
+    fn read_time(&self, time_ms: u64) -> Option<WireEvent> {
+        let newest_ns = self.anchor?.unix_ns_at(self.ticks?, self.clock_rate?);
+        let unix_ns = i128::from(time_ms) * 1_000_000;
+        let is_alike = (unix_ns - newest_ns).abs() <= CLOCKS_ALIKE;
+        is_alike.then(|| i64::try_from(unix_ns).ok()).flatten().map(|unix_ns| WireEvent::Clock(TimeNs(unix_ns)))
     }
 
     fn read_packet(&mut self, packet: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
@@ -570,6 +598,29 @@ mod tests {
         let unix_s = (1_i64 << 32) - UNIX_IN_NTP_S;
         let samples = left(&[report(0, 1 << 31, 0), datum(1, 0)]);
         assert_eq!(samples[0].t_device, Some(TimeNs(unix_s * 1_000_000_000 + 500_000_000)));
+    }
+
+    #[test]
+    fn the_phones_clock_is_read_once_it_is_known_to_be_that_of_the_packets() {
+        let clock = |time_ms: i64| {
+            let mut message = [0; 64];
+            let count = time_message(time_ms as u64, &mut message).expect("room");
+            message[..count].to_vec()
+        };
+        let now_ms = UNIX_S * 1000 + 40;
+        let mut bytes = [clock(now_ms), describe(RATE), clock(now_ms)].concat();
+        assert_eq!(decode(&bytes), [], "no packet has a time yet");
+        bytes.extend([framed(1, &report(NTP_S, 0, 0)), framed(0, &datum(1, 0))].concat());
+        // Another clock, and this one.
+        bytes.extend(
+            [clock(now_ms - 3_600_000), clock(now_ms), b"RTSP/1.0 200 OK\r\nTime-Echo: x\r\n\r\n".to_vec()].concat(),
+        );
+        let [WireEvent::Note, WireEvent::Sample(_), WireEvent::Sample(_), clock_ms, bad] = decode(&bytes)[..] else {
+            panic!("{:?}", decode(&bytes))
+        };
+        assert_eq!(clock_ms, WireEvent::Clock(TimeNs(now_ms * 1_000_000)));
+        assert_eq!(bad, WireEvent::Rejected(WireFault::BadNumber));
+        assert_eq!(time_message(1, &mut [0; 16]), None);
     }
 
     #[test]

@@ -23,7 +23,10 @@ const TICKS: u32 = u32::MAX - 50_000;
 /// Running number of the first packet, close to its wrap.
 const NUMBER: u16 = 65_500;
 
-/// A Companion: its status page and its RTSP server.
+/// From the image of an eye until its packet is sent.
+const PHONE_TAKES_MS: u64 = 60;
+
+/// A Companion: its status page, its RTSP server and its clock.
 struct Companion {
     status_port: u16,
     shared: Arc<Shared>,
@@ -36,6 +39,9 @@ struct Shared {
     /// Whether datagrams get through.
     datagrams: AtomicBool,
     rtsp_port: u16,
+    echo_port: u16,
+    /// What the phone's clock shows, in Unix milliseconds.
+    time_ms: AtomicU64,
     /// No packet comes by itself, behind the answer to PLAY.
     mute: AtomicBool,
     /// As a phone that has left the network: nothing is answered any more.
@@ -57,19 +63,26 @@ impl Companion {
     fn start(status_port: u16) -> Self {
         let status = TcpListener::bind(("127.0.0.1", status_port)).expect("the port is free");
         let rtsp = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let echo = TcpListener::bind("127.0.0.1:0").expect("a port");
         let shared = Arc::new(Shared {
             stop: AtomicBool::new(false),
             datagrams: AtomicBool::new(true),
             mute: AtomicBool::new(false),
             gone: AtomicBool::new(false),
             rtsp_port: rtsp.local_addr().expect("bound").port(),
+            echo_port: echo.local_addr().expect("bound").port(),
+            time_ms: AtomicU64::new(UNIX_S * 1000 + PHONE_TAKES_MS),
             options: AtomicU64::new(0),
             teardowns: AtomicU64::new(0),
             open: Mutex::default(),
             playing: Mutex::default(),
         });
         let status_port = status.local_addr().expect("bound").port();
-        let threads = vec![serve(status, Arc::clone(&shared), tell_status), serve(rtsp, Arc::clone(&shared), stream)];
+        let threads = vec![
+            serve(status, Arc::clone(&shared), tell_status),
+            serve(rtsp, Arc::clone(&shared), stream),
+            serve(echo, Arc::clone(&shared), echo_time),
+        ];
         Self { status_port, shared, threads, next: 0 }
     }
 
@@ -106,6 +119,7 @@ impl Companion {
         packet.extend(SOURCE.to_be_bytes());
         packet.extend(payload);
         self.next += 1;
+        self.shared.time_ms.store(UNIX_S * 1000 + self.next * 5 + PHONE_TAKES_MS, Ordering::Relaxed);
         packet
     }
 
@@ -192,14 +206,15 @@ fn read_head(reader: &mut impl BufRead) -> io::Result<Vec<String>> {
     }
 }
 
-fn status(rtsp_port: u16, gaze_connected: bool) -> String {
+fn status(rtsp_port: u16, echo_port: u16, gaze_connected: bool) -> String {
     let sensor = |sensor: &str, conn_type: &str, port: u16, connected: bool| {
         format!(
             r#"{{"data":{{"conn_type":"{conn_type}","connected":{connected},"ip":"127.0.0.1","params":"camera={sensor}","port":{port},"protocol":"rtsp","sensor":"{sensor}","stream_error":false}},"model":"Sensor"}}"#
         )
     };
     let components = [
-        r#"{"data":{"battery_level":81,"battery_state":"OK","device_id":"d55a336264ad73d7","device_name":"Neon","ip":"127.0.0.1","memory":123456789,"memory_state":"OK","time_echo_port":12321},"model":"Phone"}"#.into(),
+        r#"{"data":{"battery_level":81,"battery_state":"OK","device_id":"d55a336264ad73d7","device_name":"Neon","ip":"127.0.0.1","memory":123456789,"memory_state":"OK","time_echo_port":ECHO},"model":"Phone"}"#
+            .replace("ECHO", &echo_port.to_string()),
         r#"{"data":{"glasses_serial":"123","module_serial":"654321","version":"2.0","world_camera_serial":"x"},"model":"Hardware"}"#.into(),
         sensor("world", "DIRECT", rtsp_port, true),
         sensor("gaze", "WEBSOCKET", 8081, true),
@@ -212,7 +227,19 @@ fn tell_status(stream: TcpStream, shared: &Shared) -> io::Result<()> {
     let mut reader = BufReader::new(stream.try_clone()?);
     let head = read_head(&mut reader)?;
     assert!(head[0].starts_with("GET /api/status HTTP/1."), "{head:?}");
-    answer_http(stream, "200 OK", &status(shared.rtsp_port, true))
+    answer_http(stream, "200 OK", &status(shared.rtsp_port, shared.echo_port, true))
+}
+
+/// Answers each eight bytes with themselves and its own time.
+fn echo_time(mut stream: TcpStream, shared: &Shared) -> io::Result<()> {
+    let mut asked = [0; 8];
+    loop {
+        stream.read_exact(&mut asked)?;
+        if !shared.gone.load(Ordering::Acquire) {
+            let time_ms = shared.time_ms.load(Ordering::Relaxed);
+            stream.write_all(&[asked, time_ms.to_be_bytes()].concat())?;
+        }
+    }
 }
 
 fn answer_http(mut stream: TcpStream, outcome: &str, body: &str) -> io::Result<()> {
@@ -384,6 +411,23 @@ fn datagrams_are_followed_and_what_is_wrong_with_them_is_counted() {
 }
 
 #[test]
+fn samples_are_put_to_the_time_of_their_images() {
+    let mut companion = Companion::start(0);
+    let mut handle = start(&companion.spec());
+    let mut delays_s = Vec::new();
+    let mut pop = || {
+        while let Some(decision) = handle.decisions.pop() {
+            delays_s.push((decision.sample.t_arrival - decision.sample.t_sample).seconds());
+        }
+        // Arrival times alone would tell of no delay that all samples have.
+        let newest = &delays_s[delays_s.len().saturating_sub(50)..];
+        newest.iter().filter(|delay_s| **delay_s > PHONE_TAKES_MS as f64 * 0.5e-3).count() >= 40
+    };
+    companion.stream_until("delays of the phone", &mut pop);
+    assert_eq!(handle.control.counters().of(Counter::ClockResets), 0);
+}
+
+#[test]
 fn packets_come_over_tcp_where_datagrams_do_not() {
     let mut companion = Companion::start(0);
     companion.shared.datagrams.store(false, Ordering::Release);
@@ -495,7 +539,7 @@ fn what_is_no_companion_is_refused_with_what_to_do() {
     assert!(message.contains("`<html>`; expected the status of a Companion"), "{message}");
     let message = refused_with(|stream| answer_http(stream, "200 OK", r#"{"result":[{"model":"Phone"}]}"#));
     assert!(message.contains("expected a connected sensor `gaze`"), "{message}");
-    let message = refused_with(move |stream| answer_http(stream, "200 OK", &status(port, false)));
+    let message = refused_with(move |stream| answer_http(stream, "200 OK", &status(port, 0, false)));
     assert!(message.contains("connect the glasses to the phone"), "{message}");
     let message = refused_with(|mut stream| {
         stream.write_all(b"HTTP/1.1 200 OK\r\n\r\n")?;
@@ -507,7 +551,7 @@ fn what_is_no_companion_is_refused_with_what_to_do() {
     let message = refused_with(|mut stream| stream.read_to_end(&mut Vec::new()).map(drop));
     assert!(message.contains("timed out"), "{message}");
     // No stream at the port that the status names.
-    let message = refused_with(move |stream| answer_http(stream, "200 OK", &status(port, true)));
+    let message = refused_with(move |stream| answer_http(stream, "200 OK", &status(port, 0, true)));
     assert!(message.contains("cannot be talked to"), "{message}");
 }
 
@@ -522,7 +566,7 @@ fn a_status_in_chunks_is_read_and_a_refused_session_is_told() {
         stream.write_all(b"RTSP/1.0 500 Internal Server Error\r\nCSeq: 1\r\n\r\n").expect("writes");
     });
     let message = refused_with(move |mut stream| {
-        let body = status(port, true);
+        let body = status(port, 0, true);
         let (first, second) = body.split_at(100);
         write!(stream, "HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n{:x}\r\n{first}\r\n", first.len())?;
         write!(stream, "{:X};x=y\r\n{second}\r\n0\r\n\r\n", second.len())?;
