@@ -17,7 +17,13 @@ Module = tuple[str, ...]
 Names = tuple[str, ...]
 Edges = dict[Module, dict[Module, str]]
 
-NOT_CODE = re.compile(r"/\*.*?\*/|//[^\n]*|b?\"(?:\\.|[^\"\\])*\"", re.DOTALL)
+NOT_CODE = re.compile(
+    r"/\*.*?\*/|//[^\n]*"
+    r"|\bb?r(?P<hashes>#*)\".*?\"(?P=hashes)"
+    r"|b?\"(?:\\.|[^\"\\])*\""
+    r"|b?'(?:\\[^']+|\\'|[^'\\])'",
+    re.DOTALL,
+)
 TESTS = "#[cfg(test)]\nmod tests {"
 USE = re.compile(r"(?:^|\n)\s*(pub(?:\([^)]*\))?\s+)?use\s+([^;]+);")
 PATH = re.compile(r"(?<![\w:.])(\w+(?:::\w+)+)")
@@ -28,7 +34,7 @@ def code(path: Path) -> str:
     text = path.read_text(encoding="utf-8")
     text = text[: text.find(TESTS)] if TESTS in text else text
     # A comment may hold a quotation mark and a text two slashes: whichever begins first is the one.
-    return NOT_CODE.sub(lambda found: '""' if found[0].endswith('"') else " ", text)
+    return NOT_CODE.sub(lambda found: " " if found[0].startswith("/") else '""', text)
 
 
 def branches(tree: str) -> Iterator[Names]:
@@ -140,6 +146,9 @@ def circles(source: Path) -> list[str]:
 
 
 if __name__ == "__main__":
+    for given in sys.argv[1:]:
+        if not any(Path(given).rglob("*.rs")):
+            sys.exit(f"{given}: found no Rust source there, expected the folder of a crate's sources")
     all_circles = [line for source in sys.argv[1:] for line in circles(Path(source))]
     print("\n".join(all_circles) or "no circles")
     sys.exit(1 if all_circles else 0)

@@ -66,6 +66,12 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     table.look_for_headers(clock.column);
     // The name of the time may hold the date.
     table.compare_names_by(|one, other| one == other || is_time(one) && is_time(other));
+    let read = eyes.iter().flatten().flat_map(|(diameter, validity, _)| [Some(*diameter), *validity]);
+    let last = read.chain([Some(clock.column), blinks.id, blinks.duration]).flatten().max();
+    // Texts of the user's, which nothing stands around.
+    if table.names.iter().rposition(|name| name == "USER" || name.starts_with("AOI")) > last {
+        table.allow_more_cells();
+    }
     while let Some(row) = table.next_row(log) {
         let t = match row.cell(clock.column).and_then(|cell| time_ns(cell, clock.ns_per_unit)) {
             Ok(t_ns) => TimeNs(t_ns),

@@ -258,8 +258,13 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
 fn take(row: &Row<'_>, log: &mut LogBuilder) -> Result<(), LogFault> {
     let t = time(row.t, 0).ok_or(LogFault::BadNumber)?;
     let confidence = number(row.confidence).filter(|confidence| confidence.is_finite()).ok_or(LogFault::BadNumber)?;
-    let confidence = share(confidence)?;
-    let size = size(row.diameter).map(|size| if confidence > 0.0 { size } else { 0.0 });
-    log.push_sized(size, LogSample { confidence, ..LogSample::lost(t, row.eye) }, row.line);
+    let lost = LogSample::lost(t, row.eye);
+    match share(confidence) {
+        Ok(confidence) => {
+            let size = size(row.diameter).map(|size| if confidence > 0.0 { size } else { 0.0 });
+            log.push_sized(size, LogSample { confidence, ..lost }, row.line);
+        }
+        Err(fault) => log.push_sized(Err(fault), lost, row.line),
+    }
     Ok(())
 }

@@ -238,16 +238,16 @@ impl LogBuilder {
         if let Some((rows, line)) = self.wide {
             self.warn(format!(
                 "{rows} rows hold more cells than there are names of columns, the first in line {line}, and were left out, \
-                 since which cell is of which column is not known: were decimal commas (3,75 for 3.75) written without \
-                 quotation marks, or a column without a name? Export the log again, with decimal points and a name for each \
-                 column"
+                 since which cell is of which column is not known: was what parts the cells written within one and without \
+                 quotation marks, as in decimal commas (3,75 for 3.75), or has a column no name (in a BIDS recording, in \
+                 `Columns` of its JSON file)? Export the log again, with decimal points and a name for each column"
             ));
         }
         let unlikely = self.faults.of(LogFault::BadConfidence);
         if unlikely > 0 {
             self.warn(format!(
-                "{unlikely} samples were left out, whose confidence lies outside 0 to 1: is it in per cent? Let what wrote the \
-                 log divide it"
+                "{unlikely} samples are taken for lost, whose confidence lies above 1: is it in per cent? Let what wrote the log \
+                 divide it"
             ));
         }
         if self.headers.count > 0 {

@@ -6,7 +6,7 @@ use super::fault::{LogFault, ReplayError};
 use super::input::LogInput;
 use super::recording::{GREATEST_NS, LogBuilder};
 pub(super) use super::text::is_missing;
-use super::text::{self, Lines, is_word};
+use super::text::{self, Lines, is_word, named};
 use crate::cells::{cells, has_more, separator};
 
 /// Columns of a table that are told apart; later ones are not looked at.
@@ -24,8 +24,9 @@ pub(super) struct Table {
     is_header: fn(&[u8]) -> bool,
     /// Whether two names are of the same column.
     are_alike: fn(&str, &str) -> bool,
-    /// Columns of a row in all, where it cannot have more.
+    /// Columns of a row in all, where they are told apart.
     columns: Option<usize>,
+    takes_more: bool,
     /// The row read last, its number, and begin and end of each of its cells.
     line: Vec<u8>,
     number: u64,
@@ -65,6 +66,7 @@ impl Table {
             line: Vec::new(),
             number: 0,
             columns: (width < MAX_COLUMNS).then_some(width),
+            takes_more: false,
             cells: Vec::new(),
         }))
     }
@@ -79,9 +81,10 @@ impl Table {
         self.are_alike = are_alike;
     }
 
-    /// Rows may hold more than the header names, as a text of the user's does that has separators.
+    /// Rows may hold more than the header names, as a text of the user's does that has separators; see
+    /// [`Row::has_more`].
     pub(super) const fn allow_more_cells(&mut self) {
-        self.columns = None;
+        self.takes_more = true;
     }
 
     /// The first column whose name `is` the one.
@@ -107,22 +110,29 @@ impl Table {
             Row::cut(&self.line, self.number, self.separator, self.width, &mut self.cells);
             if self.is_header_again() {
                 let again: Vec<_> = names(&self.line, self.separator).collect();
-                let is_same = again.len() == self.names.len()
-                    && self.names.iter().zip(&again).all(|(one, other)| (self.are_alike)(one, other));
+                let (names, again) = (named(&self.names), named(&again));
+                let is_same = again.len() == names.len()
+                    && names.iter().zip(again).all(|(one, other)| (self.are_alike)(one, other));
                 if !log.header_again(self.number, is_same) {
                     return None;
                 }
-            } else if self.columns.is_some_and(|columns| has_more(&self.line, self.separator, columns)) {
+            } else if !self.takes_more && self.row().has_more() {
                 log.has_more_cells(self.number);
             } else {
                 break;
             }
         }
-        Some(Row { line: &self.line, cells: &self.cells, number: self.number })
+        Some(self.row())
+    }
+
+    /// The row read last.
+    fn row(&self) -> Row<'_> {
+        let Self { separator, columns, number, .. } = *self;
+        Row { line: &self.line, cells: &self.cells, number, separator, columns }
     }
 
     fn is_header_again(&self) -> bool {
-        let row = Row { line: &self.line, cells: &self.cells, number: self.number };
+        let row = self.row();
         self.time.is_some_and(|time| row.cell(time).map_or(true, is_word)) && (self.is_header)(&self.line)
     }
 }
@@ -139,6 +149,9 @@ pub(super) struct Row<'a> {
     cells: &'a [(u32, u32)],
     /// Of its line, from 1.
     pub(super) number: u64,
+    separator: u8,
+    /// As many as the header names, where that is known.
+    columns: Option<usize>,
 }
 
 impl<'a> Row<'a> {
@@ -150,7 +163,12 @@ impl<'a> Row<'a> {
             let begin = (cell.as_ptr() as usize - origin) as u32;
             (begin, begin + cell.len() as u32)
         }));
-        Self { line, cells: into, number }
+        Self { line, cells: into, number, separator, columns: None }
+    }
+
+    /// Whether it holds more than the header names, so that which cell is of which column is not known.
+    pub(super) fn has_more(&self) -> bool {
+        self.columns.is_some_and(|columns| has_more(self.line, self.separator, columns))
     }
 
     /// The cell of a column, or that the row ends before it.

@@ -88,7 +88,10 @@ impl Lines {
                 log.count(LogFault::Malformed);
                 return None;
             }
-            return Some(Line { number: self.number, bytes: bytes.strip_suffix(b"\r").unwrap_or(bytes) });
+            let bytes = bytes.strip_suffix(b"\r").unwrap_or(bytes);
+            // Where files were put together, each has its own.
+            let bytes = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(bytes);
+            return Some(Line { number: self.number, bytes });
         }
     }
 
@@ -146,12 +149,18 @@ impl Header {
     /// in files that were put together, and then whether it names the same columns.
     pub(crate) fn again(&self, line: &[u8], time: Option<&[u8]>, is_header: fn(&[u8]) -> bool) -> Option<bool> {
         let is_again = time.is_none_or(is_word) && is_header(line.trim_ascii());
-        is_again.then(|| *self == Self::of(line, self.separator))
+        is_again.then(|| named(&self.names) == named(&Self::of(line, self.separator).names))
     }
 
     pub(crate) fn has(&self, name: &str) -> bool {
         self.column(name).is_some()
     }
+}
+
+/// Names of columns without those at the end that are none, as a spreadsheet fills up lines.
+pub(super) fn named(names: &[String]) -> &[String] {
+    let last = names.iter().rposition(|name| !name.is_empty());
+    &names[..last.map_or(0, |last| last + 1)]
 }
 
 /// Whether a cell begins as no number does.
@@ -292,13 +301,14 @@ pub(super) fn positive_size(cell: &[u8]) -> Result<f64, LogFault> {
     size(cell).and_then(|size| if size < 0.0 { Err(LogFault::Negative) } else { Ok(size) })
 }
 
-/// A confidence, which is one from 0 to 1; what lies beside that by rounding is on it.
+/// A confidence, which is one from 0 to 1: what lies above that by rounding is on it, and one below is that of a pupil
+/// which was not found.
 pub(super) fn share(confidence: f64) -> Result<f32, LogFault> {
-    let is_one = (-ROUNDING..=1.0 + ROUNDING).contains(&confidence);
-    if is_one { Ok(confidence.clamp(0.0, 1.0) as f32) } else { Err(LogFault::BadConfidence) }
+    if confidence <= 1.0 + ROUNDING { Ok(confidence.clamp(0.0, 1.0) as f32) } else { Err(LogFault::BadConfidence) }
 }
 
 const ROUNDING: f64 = 1e-6;
+const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
 #[cfg(test)]
 mod tests {

@@ -167,6 +167,10 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         if !columns.is_of_eyes(&row) {
             continue;
         }
+        if row.has_more() {
+            log.has_more_cells(row.number);
+            continue;
+        }
         let recording = columns.recording.map(|column| column.and_then(|column| row.cell(column).ok()).unwrap_or(b""));
         if !first.has(recording) {
             continue;
@@ -205,6 +209,8 @@ fn open(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Option<(Table, Col
     let Some(columns) = Columns::of(&table) else { return Ok(None) };
     let eyes = columns.eyes.iter().flatten().flat_map(|eye| [Some(eye.diameter), eye.validity]);
     table.look_for_headers(columns.time);
+    // A message may hold tabs; rows of the eyes are looked at when they are known.
+    table.allow_more_cells();
     let others = [Some(columns.time), columns.sensor, columns.event];
     let finer = FINER_TIMES.map(|wanted| table.column(|name| plain_name(name).0 == wanted));
     table.keep_to(eyes.chain(others).chain(columns.recording).chain(finer).flatten());

@@ -702,7 +702,7 @@ impl Stream {
                 Some((Channel::Confidence { factor, .. }, figure)) => match share(factor * figure) {
                     Ok(confidence) => confidence,
                     Err(fault) => {
-                        log.count(fault);
+                        log.push_sized(Err(fault), LogSample::lost(t, eye), record);
                         continue;
                     }
                 },

@@ -213,7 +213,16 @@ fn a_row_of_more_cells_than_names_is_not_read() {
     let row = |k: i64| format!("x,{},PuRe,40,41,3.5,go, now\n", 1000 + 5 * k);
     let header = "filename,timestamp_ms,algorithm,diameter_px,undistortedDiameter_px,physicalDiameter_mm,message\n";
     let pupilext = header.to_owned() + &(0..300).map(row).collect::<String>();
-    for text in [neon, pupilext] {
+    // So may one of Gazepoint's behind all figures, and a message of Tobii's, which is no row of the eyes.
+    let row = |k: i64| format!("1.{:03},4.0,1,go, now\n", 2 * k);
+    let gazepoint = "TIME,LPMM,LPMMV,USER\n".to_owned() + &(0..300).map(row).collect::<String>();
+    let row = |k: i64| {
+        let message = if k % 100 == 0 { format!("{}\tMessage\t\ta\ttab\n", 1000 + 5 * k) } else { String::new() };
+        format!("{}\tEye Tracker\t4.0\n{message}", 1000 + 5 * k)
+    };
+    let tobii = "Recording timestamp [ms]\tSensor\tPupil diameter left [mm]\n".to_owned()
+        + &(0..300).map(row).collect::<String>();
+    for text in [neon, pupilext, gazepoint, tobii] {
         let (recording, info) = info(&written(&dir, "log", text));
         assert_eq!((recording.len(), recording.faults().total()), (300, 0), "{:?}", info.notes);
     }
@@ -275,6 +284,11 @@ fn a_header_that_comes_again_is_none_but_of_other_columns_ends_the_log() {
         let (recording, info) = info(&written(&dir, "log", joined(&again)));
         assert_eq!((recording.len(), recording.faults().total()), (alone.len(), 0), "{format}");
         assert!(info.notes.iter().any(|note| note.contains("its header comes again in line 102")), "{:?}", info.notes);
+        // With marks of byte order, and filled up by a spreadsheet.
+        let separator = if header.contains('\t') { '\t' } else { ',' };
+        let marked = format!("\u{feff}{}", joined(&format!("\u{feff}{header}{separator}{separator}")));
+        let (recording, told) = self::info(&written(&dir, "log", marked));
+        assert_eq!((recording.len(), recording.faults().total()), (alone.len(), 0), "{format}: {:?}", told.notes);
         let error = Recording::read(&written(&dir, "log", joined(other))).expect_err("two tables").to_string();
         assert!(error.contains(", line 102: found another header, of other columns"), "{format}: {error}");
     }
@@ -327,16 +341,36 @@ fn core_keeps_the_best_rows_of_each_eye_and_tells_what_is_lost_by_that() {
 }
 
 #[test]
+fn an_eye_that_was_not_found_is_lost_however_its_confidence_is_written() {
+    let dir = TempDir::new().expect("a folder");
+    let read = |confidence: &str| {
+        let header = "pupil_timestamp,eye_id,confidence,norm_pos_x,diameter,method,diameter_3d\n";
+        let row = |k: u64| {
+            let (confidence, diameter) = if (90..100).contains(&k) { (confidence, "0") } else { ("0.99", "3.5") };
+            format!("1.{:03},1,{confidence},0,40,pye3d,{diameter}\n", 5 * k)
+        };
+        let rows: String = (0..200).map(row).collect();
+        let (recording, info) = info(&written(&dir, "log", format!("{header}{rows}")));
+        let valid: Vec<_> = recording.samples().map(|sample| (sample.t_sample, sample.valid)).collect();
+        (valid, recording.faults().total(), info.eyes[0].lost)
+    };
+    let lost = read("0");
+    assert_eq!(read("-1"), lost);
+    assert_eq!((lost.0.len(), lost.1, lost.2), (200, 0, 10));
+}
+
+#[test]
 fn confidence_in_per_cent_is_not_taken_for_certainty() {
     let header = "pupil_timestamp,eye_id,confidence,norm_pos_x,diameter,method,diameter_3d\n";
     let rows: String =
         (0..100).map(|k| format!("1.{:03},1,{},0,40,pye3d,3.5\n", 5 * k, ["20", "0.9", "1.0000001"][k % 3])).collect();
     let dir = TempDir::new().expect("a folder");
     let (recording, info) = info(&written(&dir, "log", format!("{header}{rows}")));
-    assert_eq!((recording.len(), recording.faults().of(LogFault::BadConfidence)), (66, 34));
-    assert!(recording.samples().all(|sample| sample.confidence == 0.9 || sample.confidence == 1.0));
+    assert_eq!((recording.len(), recording.faults().of(LogFault::BadConfidence)), (100, 34));
+    let believed: Vec<_> = recording.samples().filter(|sample| sample.valid).map(|sample| sample.confidence).collect();
+    assert!(believed.len() == 66 && believed.iter().all(|share| [0.9, 1.0].contains(share)), "{believed:?}");
     assert!(
-        info.notes[0].contains("34 samples were left out") && info.notes[0].contains("per cent"),
+        info.notes[0].contains("34 samples are taken for lost") && info.notes[0].contains("per cent"),
         "{:?}",
         info.notes
     );
