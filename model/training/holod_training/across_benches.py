@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,11 +26,12 @@ from holod_training.judging import (
 from holod_training.metrics import SSIM_WINDOW_PX
 from holod_training.network import FieldNetwork
 from holod_training.refocus import refocus_cards
+from holod_training.report import prose
 from holod_training.shards import Shard, ShardError, check_border, check_kind, open_held_out
 
 RIVAL = "smooth phase"
 CONTRASTS = {"dark on bright": "dark marks", "bright on dark": "bright marks"}
-LINE = 100
+OUTSIDE_MARK = "†"
 
 
 @torch.no_grad()
@@ -76,7 +76,11 @@ def across_benches(
             for name, network in networks.items()
         ],
         "benches": [
-            {**_bench(name, shards, judged[name]), "outside_training": _outside(networks, shards[0].optics)}
+            {
+                **_bench(name, shards, judged[name]),
+                "outside_training": _outside(networks, shards[0].optics),
+                "pupils_outside_training_mm": _pupils_outside(networks, shards[0].optics, shards[0].pupils_mm),
+            }
             for name, shards in benches
         ],
     }
@@ -87,8 +91,19 @@ def across_benches(
 
 
 def _outside(networks: dict[str, FieldNetwork], optics: OpticsConfig) -> list[str]:
-    """The networks that were trained for other benches."""
+    """The networks that were trained for other benches: for less or more diffraction."""
     return [name for name, network in networks.items() if network.config.trained.outside(optics) > 1]
+
+
+def _pupils_outside(
+    networks: dict[str, FieldNetwork], optics: OpticsConfig, pupils_mm: Sequence[float]
+) -> dict[str, list[float]]:
+    """For each network that was trained for less or more blur than a judged pupil's: these pupils."""
+    found = {
+        name: [round(mm, 4) for mm in pupils_mm if network.config.trained.blurs_outside(optics.volume_blur_px(mm))]
+        for name, network in networks.items()
+    }
+    return {name: pupils for name, pupils in found.items() if pupils}
 
 
 def _open_cards(folders: Sequence[Path], benches: dict[str, OpticsConfig], border_px: int) -> dict[str, list[Shard]]:
@@ -185,7 +200,7 @@ def markdown(result: dict[str, Any]) -> str:
         "focus over out of focus, the lesser of a near and a far card. Both at each pupil, as in the columns before. A "
         f"border of {result['border_px']} px is left out."
     )
-    lines = [textwrap.fill(about, LINE), ""]
+    lines = [prose(about), ""]
     for bench in result["benches"]:
         pupils = bench["pupils_mm"]
         contrasts = [contrast for contrast in CONTRASTS if _refocus(bench, None, contrast)]
@@ -193,13 +208,15 @@ def markdown(result: dict[str, Any]) -> str:
             *("method", *(f"s = {mm:g} mm" for mm in pupils), "right pupil ahead, dB", "foam"),
             *(f"refocus, {CONTRASTS[contrast]}" for contrast in contrasts),
         ]
-        lines += [textwrap.fill(_about(bench), LINE), "", f"| {' | '.join(labels)} |", "|---" * len(labels) + "|"]
+        lines += [prose(_about(bench)), "", f"| {' | '.join(labels)} |", "|---" * len(labels) + "|"]
         for method in dict.fromkeys(row["method"] for row in bench["rows"]):
             rows = [row for row in bench["rows"] if row["method"] == method]
             gains = bench["gain_over_rival"].get(method)
+            outside = bench["pupils_outside_training_mm"].get(method, [])
+            marks = [f" {OUTSIDE_MARK}" if pupil in outside else "" for pupil in pupils]
             cells = [
                 method,
-                *(_cell(row, gains[index] if gains else None) for index, row in enumerate(rows)),
+                *(f"{_cell(row, gains[index] if gains else None)}{marks[index]}" for index, row in enumerate(rows)),
                 " / ".join(f"{margin:+.2f}" for margin in bench["right_pupil_margin_db"].get(method, [])),
                 " / ".join(_number(1e3 * row["foam"] if "foam" in row else None, ".2f") for row in rows),
                 *(" / ".join(f"{ratio:.2f}" for ratio in _refocus(bench, method, contrast)) for contrast in contrasts),
@@ -214,13 +231,19 @@ def _goals(result: dict[str, Any]) -> list[str]:
         "The least of each bench's pupils, of refocus ratios also of its cards and marks, and what was wanted of it; "
         "**bold** where that was not reached."
     )
+    if any(bench["pupils_outside_training_mm"] for bench in result["benches"]):
+        about += f" {OUTSIDE_MARK}: of pupils with a blur, too, that the network was not trained for."
     checks = [(bench["bench"], of, bench_checks(bench, of)) for bench in result["benches"] for of in _networks(bench)]
     judged = dict.fromkeys(what for _, _, found in checks for what, _, _, _ in found)
     labels = ["bench", "network", *judged]
-    lines = ["## Goals", "", textwrap.fill(about, LINE), "", f"| {' | '.join(labels)} |", "|---" * len(labels) + "|"]
+    lines = ["## Goals", "", prose(about), "", f"| {' | '.join(labels)} |", "|---" * len(labels) + "|"]
+    outside = {
+        (bench["bench"], method) for bench in result["benches"] for method in bench["pupils_outside_training_mm"]
+    }
     for name, method, found in checks:
         cells = {what: f"{value if met else f'**{value}**'} ({wanted})" for what, value, wanted, met in found}
-        lines.append(f"| {' | '.join([name, method, *(cells.get(what, '-') for what in judged)])} |")
+        marked = f"{method} {OUTSIDE_MARK}" if (name, method) in outside else method
+        lines.append(f"| {' | '.join([name, marked, *(cells.get(what, '-') for what in judged)])} |")
     return [*lines, ""]
 
 
@@ -242,6 +265,8 @@ def _about(bench: dict[str, Any]) -> str:
     far, near = bench["depth_dpt"]
     names = bench["outside_training"]
     outside = f"; outside what {', '.join(names)} {'was' if len(names) == 1 else 'were'} trained for" if names else ""
+    if bench["pupils_outside_training_mm"]:
+        outside += f"; {OUTSIDE_MARK} a blur that the network was not trained for"
     least, most = min(bench["volume_fresnel_px2"]), max(bench["volume_fresnel_px2"])
     return (
         f"**{bench['bench']}**: {bench['pixel_pitch_um']:g} um, {bench['eyepiece_focal_length_mm']:g} mm, "

@@ -98,6 +98,11 @@ class TrainedRange:
         worst = max(max(least / px2, px2 / most) for px2 in optics.volume_fresnel_px2)
         return worst if worst > 1 + SAME else 1.0
 
+    def blurs_outside(self, volume_blur_px: float) -> bool:
+        """Whether a pupil blurs less or more than any that was trained for."""
+        least, most = self.volume_blur_px
+        return not least / (1 + SAME) <= volume_blur_px <= most * (1 + SAME)
+
     def told_of(self, optics: OpticsConfig) -> str:
         """How a bench lies outside, in `holod`'s words."""
         found, (least, most) = optics.volume_fresnel_px2, self.volume_fresnel_px2

@@ -43,7 +43,7 @@ from holod_training.plots import write_plots
 from holod_training.refocus import refocus_cards
 from holod_training.report import markdown
 from holod_training.rgbd import read_pictures, write_rgbd_sheet
-from holod_training.shards import check_border, open_held_out
+from holod_training.shards import Shard, check_border, open_held_out
 from holod_training.sheets import write_sheet
 from holod_training.solver import optimise
 from holod_training.tradeoff import focus_curve, on_the_same_scenes
@@ -94,7 +94,9 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
         "weights": config.weights.name,
         "provenance": metadata["provenance"],
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "optics": dataclasses.asdict(optics),
         "scenes": len(shards),
+        "numbers_of_seed": _numbers_of_seed(shards),
         "size": [shards[0].height, shards[0].width],
         "focus_dpt": list(shards[0].focus_dpt[BETWEEN] if config.judge_between else shards[0].focus_dpt),
         "border_px": config.border_px,
@@ -142,6 +144,14 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     write_beside(config.out / "evaluation.json", (json.dumps(result, indent=1) + "\n").encode())
     write_beside(config.out / "evaluation.md", markdown(result).encode())
     return result
+
+
+def _numbers_of_seed(shards: list[Shard]) -> dict[str, list[int]]:
+    """Which scenes `holod-scenes` made these, by their seed."""
+    found: dict[str, list[int]] = {}
+    for shard in shards:
+        found.setdefault(shard.seed, []).append(shard.index)
+    return {seed: sorted(numbers) for seed, numbers in sorted(found.items())}
 
 
 def _outside(network: FieldNetwork) -> str | None:

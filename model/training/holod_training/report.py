@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from holod_training.export import write_beside
-from holod_training.goals import GOALS_SIZE, ReportError, checks, find_row, require_one_set_of_pupils, row_of
-from holod_training.judging import PICTURES
+from holod_training.goals import (
+    GOALS_SCENES,
+    ReportError,
+    checks,
+    find_row,
+    on_the_goals_scenes,
+    require_one_set_of_pupils,
+    row_of,
+)
+from holod_training.judging import OURS, PICTURES
 
 NUMBERS = (
     ("psnr_db", "PSNR dB", 2),
@@ -29,6 +38,14 @@ PLOTS = {
     "capacity": "quality against capacity",
     "run_time": "quality against run time",
 }
+
+
+LINE = 100
+
+
+def prose(text: str) -> str:
+    """In lines of the pages' length; no name is broken at its hyphens."""
+    return textwrap.fill(text, LINE, break_on_hyphens=False, break_long_words=False)
 
 
 def markdown(result: dict[str, Any]) -> str:
@@ -80,15 +97,18 @@ def _opening(result: dict[str, Any]) -> list[str]:
     return [
         f"# Evaluation of {result['weights']}",
         "",
-        f"{result['date']}: {result['scenes']} held-out scenes of {width}x{height}, "
-        f"{planes}, a border of {result['border_px']} px left out; linear light, peak 1. Means over scenes, in "
-        f"brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}{others}. Slope "
-        "and correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
-        "depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Foam: mean energy of structure of 4 to 16 px out of "
-        f"focus that the target does not have there; less is better. Everything is after double phase.{optimised} Two "
-        "rows are no holograms: the flat oracle is the target's mean at every focus, RGB-D blur is what a simple "
-        "incoherent display would show that knows the picture and its depth alone, and guesses nothing that is hidden.",
-        *(line for told in outside for line in ("", told)),
+        prose(
+            f"{result['date']}: {result['scenes']} held-out scenes of {width}x{height}, "
+            f"{planes}, a border of {result['border_px']} px left out; linear light, peak 1; means over "
+            f"scenes, in brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}"
+            f"{others}. Slope and correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, "
+            "0 = one picture at all depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Foam: mean energy of "
+            "structure of 4 to 16 px out of focus that the target does not have there; less is better. Everything is "
+            f"after double phase.{optimised} Two rows are no holograms: the flat oracle is the target's mean at every "
+            "focus, RGB-D blur is what a simple incoherent display would show that knows the picture and its depth "
+            "alone, and guesses nothing that is hidden."
+        ),
+        *(line for told in outside for line in ("", prose(told))),
     ]
 
 
@@ -112,10 +132,16 @@ def _paired(result: dict[str, Any]) -> list[str]:
     lines = [
         "## Ours less each other, scene by scene",
         "",
-        "Means of the differences on the scenes that both were judged on; an interval without 0 is a difference "
-        "that scenes alone hardly make.",
+        prose(
+            "Means of the differences on the scenes that both were judged on; an interval without 0 is a difference "
+            "that scenes alone hardly make."
+        ),
         "",
     ]
+    paired = {row["method"] for row in result["paired"]}
+    if means_alone := [name for name in _methods(result) if name not in (OURS, *paired)]:
+        kept = "Of an evaluation before this one, of which means alone were kept, and so without differences"
+        lines += [prose(f"{kept}: {'; '.join(means_alone)}."), ""]
     lines += _header(["s mm", "against", "scenes", *(label for _, label, _ in PAIRED)])
     for pupil in result["pupils_mm"]:
         for method in _methods(result):
@@ -145,8 +171,10 @@ def _refocus(result: dict[str, Any]) -> list[str]:
     lines = [
         "## Refocus ratio",
         "",
-        "Gradient energy of a card in focus over out of focus; near card at 7/8 of the depth range in dioptres, far "
-        "card at 7/80 (default bench: 2.5 and 0.25 dpt).",
+        prose(
+            "Gradient energy of a card in focus over out of focus; near card at 7/8 of the depth range in dioptres, "
+            "far card at 7/80 (default bench: 2.5 and 0.25 dpt)."
+        ),
         "",
     ]
     lines += _header(["method", "marks", "card", *(f"s = {p:g}" for p in pupils)])
@@ -166,8 +194,10 @@ def _marks(result: dict[str, Any]) -> list[str]:
     lines = [
         "## Bright marks on exact black",
         "",
-        "All light that is seen over what was put in, before and after double phase, and the mean light after it, in "
-        "thousandths of white, more than 16 px from where any should be.",
+        prose(
+            "All light that is seen over what was put in, before and after double phase, and the mean light after it, "
+            "in thousandths of white, more than 16 px from where any should be."
+        ),
         "",
     ]
     lines += _header(["marks", "method", *(f"s = {p:g}" for p in pupils)])
@@ -186,9 +216,11 @@ def _costs(result: dict[str, Any]) -> list[str]:
     lines = [
         "## Costs",
         "",
-        f"Time for one field at s = {result['run_time']['pupil_mm']:g} mm, all methods in turn in this run, median of "
-        "the calls, as ratio to ours: one thread's CPU time, or wall time on a GPU. Operations: convolutions, matrix "
-        "products (two a multiply-add), bilinear taps and FFTs.",
+        prose(
+            f"Time for one field at s = {result['run_time']['pupil_mm']:g} mm, all methods in turn in this run, median "
+            "of the calls, as ratio to ours: one thread's CPU time, or wall time on a GPU. Operations: convolutions, "
+            "matrix products (two a multiply-add), bilinear taps and FFTs."
+        ),
         "",
     ]
     networks = {row["method"]: row for row in result["networks"]}
@@ -212,8 +244,10 @@ def _double_phase(result: dict[str, Any]) -> list[str]:
     return [
         "## Double phase",
         "",
-        f"It costs ours {', '.join(costs)} mm. Clipped pixels: {', '.join(shares)} mm. Quantiles of the field's "
-        f"amplitude: {quantiles}.",
+        prose(
+            f"It costs ours {', '.join(costs)} mm. Clipped pixels: {', '.join(shares)} mm. Quantiles of the field's "
+            f"amplitude: {quantiles}."
+        ),
     ]
 
 
@@ -224,11 +258,10 @@ def _plots(result: dict[str, Any]) -> list[str]:
 
 
 def _goals(result: dict[str, Any]) -> list[str]:
-    size = result["size"]
     lines = ["## Goals", ""]
-    if size != GOALS_SIZE:
-        set_for = f"{GOALS_SIZE[1]}x{GOALS_SIZE[0]}"
-        lines += [f"The goals were set for {set_for}; these scenes are {size[1]}x{size[0]}.", ""]
+    if not on_the_goals_scenes(result):
+        set_for = f"What is wanted in dB, slope and foam was set for {GOALS_SCENES}; these are others."
+        lines += [prose(f"{set_for} So only what is wanted on any scenes is asked for here."), ""]
     lines += _header(["what", "found", "wanted", ""])
     return lines + [
         _line([what, found, wanted, "yes" if ok else "**no**"]) for what, found, wanted, ok in checks(result)

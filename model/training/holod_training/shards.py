@@ -32,7 +32,7 @@ def same_focuses(found: Sequence[float], expected: Sequence[float]) -> bool:
     return len(found) == len(expected) and all(abs(f - e) <= 1e-3 for f, e in zip(found, expected, strict=True))
 
 
-def _same_bench(one: OpticsConfig, other: OpticsConfig) -> bool:
+def same_bench(one: OpticsConfig, other: OpticsConfig) -> bool:
     """Whether benches are alike to 1e-4 in everything."""
     pairs = zip((*one.wavelengths_nm, one.pixel_pitch_um), (*other.wavelengths_nm, other.pixel_pitch_um), strict=True)
     return _same_blur(one, other) and all(abs(a - b) <= 1e-4 * b for a, b in pairs)
@@ -179,7 +179,7 @@ class Shard:
         # As the rig had it: the angle is what is left of a division.
         focal_length_mm = float(f"{pitch_um * 1e-3 / angle:.9g}")
         found = OpticsConfig((red, green, blue), pitch_um, focal_length_mm, far, near)
-        return DEFAULT_BENCH if _same_bench(found, DEFAULT_BENCH) else found
+        return DEFAULT_BENCH if same_bench(found, DEFAULT_BENCH) else found
 
     def on(self, optics: OpticsConfig) -> Shard:
         """The same scene with the pupils and focuses that show its pictures on another bench."""
@@ -248,7 +248,7 @@ def open_shards(folder: Path, optics: OpticsConfig | None = None, limit: int | N
     if optics is not None:
         return [shard.on(optics) for shard in shards]
     for shard in shards[1:]:
-        if not _same_bench(shard.optics, shards[0].optics):
+        if not same_bench(shard.optics, shards[0].optics):
             raise ShardError(
                 f"{shard.path}: rendered for {shard.optics}, but {shards[0].path.name} for {shards[0].optics}; "
                 "expected one bench: keep the scenes of each in a folder of its own"
