@@ -1,7 +1,7 @@
 //! What a person should hear of the panel and the lasers while the loop runs.
 
 use holod_calibration::TimeNs;
-use holod_calibration::rig::{Panel, PanelMode, RATE_TOLERANCE};
+use holod_calibration::rig::{PanelMode, RATE_TOLERANCE, Rig};
 use holod_slm_output::PanelEvent;
 use holod_slm_output::laser::DarkReason;
 use holod_slm_output::output::FieldEvent;
@@ -20,6 +20,8 @@ pub(super) struct OutputWatch {
     /// Refreshes a second that the rig names.
     nominal_hz: f64,
     mode: PanelMode,
+    /// Lasers are lit for single fields, at the times that the rig's window says.
+    gates_fields: bool,
     lost: Option<PanelFault>,
     /// Whether software's times are good enough to light lasers by.
     takes_software_times: bool,
@@ -37,11 +39,12 @@ pub(super) struct OutputWatch {
 }
 
 impl OutputWatch {
-    pub(super) fn new(events: rtrb::Consumer<PanelEvent>, panel: &Panel, takes_software_times: bool) -> Self {
+    pub(super) fn new(events: rtrb::Consumer<PanelEvent>, rig: &Rig, takes_software_times: bool) -> Self {
         Self {
             events,
-            nominal_hz: panel.refresh_hz,
-            mode: panel.mode,
+            nominal_hz: rig.panel.refresh_hz,
+            mode: rig.panel.mode,
+            gates_fields: rig.lasers.driver.gates_fields(),
             lost: None,
             takes_software_times,
             are_times_good: false,
@@ -136,6 +139,10 @@ impl OutputWatch {
 
     fn why_unbelieved(&self, provenance: TimestampSource) -> String {
         match provenance {
+            // No window of the rig's switches these lasers, so that none of its figures leaves more room.
+            TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External if !self.gates_fields => {
+                "their times scatter by more than 1/16 of a refresh; `holod check` says what an output is good for".into()
+            }
             TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => {
                 let wire = match self.mode {
                     PanelMode::ChannelPacked => {
@@ -228,13 +235,11 @@ const fn cure(reason: DarkReason) -> &'static str {
 
 #[cfg(test)]
 mod tests {
-    use holod_calibration::Colour;
-    use holod_calibration::rig::Rig;
-
     use super::*;
+    use holod_calibration::Colour;
 
     fn watch() -> OutputWatch {
-        OutputWatch::new(rtrb::RingBuffer::new(1).1, &Rig::default().panel, false)
+        OutputWatch::new(rtrb::RingBuffer::new(1).1, &Rig::default(), false)
     }
 
     /// The field of this number, of 180 a second.
@@ -299,12 +304,16 @@ mod tests {
     }
 
     #[test]
-    fn a_sync_wire_is_named_only_where_it_does_something() {
+    fn a_sync_wire_and_a_window_are_named_only_where_they_do_something() {
         for (mode, named) in [(PanelMode::ChannelPacked, true), (PanelMode::FieldSequential, false)] {
             let mut watch = OutputWatch { mode, ..watch() };
             let [told] = said(&mut watch, 0, |_| Some(DarkReason::Untrusted)).try_into().unwrap();
             assert_eq!(told.contains("sync_wire"), named, "{told}");
+            assert!(told.contains("on_delay_ms") && told.contains("lit_ms"), "{told}");
         }
+        let mut watch = OutputWatch { gates_fields: false, ..watch() };
+        let [told] = said(&mut watch, 0, |_| Some(DarkReason::Untrusted)).try_into().unwrap();
+        assert!(!told.contains("_ms") && !told.contains("sync_wire"), "no key of a window: {told}");
     }
 
     #[test]

@@ -13,18 +13,18 @@ use crate::present::PanelTiming;
 pub enum WindowClock {
     /// The reports: the box is told of each window, or of each colour frame's start, by them.
     Reports,
-    /// The panel itself, by a wire from its sync output to the box or by hardware of its own that gates the lasers: the
-    /// reports only say that the panel runs.
+    /// Nothing that holod is told: the panel itself, by a wire from its sync output to the box or by hardware of its own
+    /// that gates the lasers, or no window at all, of lasers that are on while they are armed. The reports only say that
+    /// the panel runs.
     Panel,
 }
 
 impl WindowClock {
     /// That of a box which can do `capability` over `panel`.
     pub fn of(panel: &Panel, capability: Capability) -> Self {
-        // A box that cannot gate single fields is lit over a panel of several colours only where that gates them.
-        let by_panel = capability.sync_wire || !capability.gates_fields;
         match FieldGate::trigger(panel) {
-            Trigger::PanelSync if by_panel => Self::Panel,
+            _ if !capability.gates_fields => Self::Panel,
+            Trigger::PanelSync if capability.sync_wire => Self::Panel,
             Trigger::PanelSync | Trigger::Host => Self::Reports,
         }
     }
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_wire_or_hardware_of_its_own_lets_the_panel_start_the_windows() {
+    fn reports_place_no_window_that_a_wire_or_the_panel_starts_and_none_of_lasers_that_have_none() {
         let packed = Rig::default().panel;
         let sequential = Panel { mode: PanelMode::FieldSequential, ..packed.clone() };
         let gates = Capability { simulated: false, gates_fields: true, has_heartbeat: true, sync_wire: false };
@@ -266,7 +266,9 @@ mod tests {
         assert_eq!(WindowClock::of(&packed, wired), WindowClock::Panel);
         assert_eq!(WindowClock::of(&packed, always_on), WindowClock::Panel);
         assert_eq!(WindowClock::of(&sequential, wired), WindowClock::Reports);
-        assert_eq!(WindowClock::of(&sequential, always_on), WindowClock::Reports);
+        let green = Panel { mode: PanelMode::Monochrome(Colour::Green), ..packed };
+        assert_eq!(WindowClock::of(&green, gates), WindowClock::Reports);
+        assert_eq!(WindowClock::of(&green, always_on), WindowClock::Panel);
     }
 
     #[test]
