@@ -773,13 +773,13 @@ fn what_a_panel_does_in_channel_packed_mode_alone_is_refused_in_the_others() {
 fn a_laser_is_told_what_brings_its_power_to_the_panel() {
     let text = "driver = \"text\"\nprofile = \"cobolt\"\ndevices = { green = \"/dev/g\", blue = \"/dev/b\" }";
     let given = |lines: &str| with_driver(&format!("{text}\n{lines}\n{ACCEPTED}"));
-    let rig = given("transmission = { green = 0.3 }").unwrap();
+    let rig = given("transmission = { green = 0.3 }\nhead_limit_mw = { green = 4 }").unwrap();
     let driver = &rig.lasers.driver;
     let told = |colour, uw| driver.head_power_uw(colour, uw).unwrap();
     // Never more than that.
     assert_eq!((told(Colour::Green, 300), told(Colour::Green, 1000), told(Colour::Blue, 1000)), (1000, 3333, 1000));
     let meaning = rig.meaning();
-    assert!(meaning.to_string().contains("\nat the laser   green 3.333 mW, blue 1 mW\n"), "{meaning}");
+    assert!(meaning.to_string().contains("\nat the laser   green 3.333 mW of at most 4, blue 1 mW\n"), "{meaning}");
     assert_eq!(meaning.lasers.power_mw.green, Some(1.0), "at the panel, as ever");
     let noted: Vec<_> = meaning.notes.iter().filter(|note| note.contains("transmission")).collect();
     assert!(matches!(&noted[..], [note] if note.starts_with("blue: ")), "{noted:?}");
@@ -787,6 +787,17 @@ fn a_laser_is_told_what_brings_its_power_to_the_panel() {
         ("transmission = { green = 30 }", "transmission.green", "percent"),
         ("transmission = { green = 0 }", "transmission.green", ""),
         ("transmission = { red = 0.3 }", "transmission.red", "name its port"),
+        ("head_limit_mw = { red = 3 }", "head_limit_mw.red", "name its port"),
+        // A slip in the share is one in what the laser gives, whatever the limit at the panel.
+        ("transmission = { green = 0.3 }", "head_limit_mw", "write head_limit_mw = { green = ... }"),
+        ("transmission = { green = 0.3 }\nhead_limit_mw = { blue = 4 }", "head_limit_mw.green", "add green"),
+        (
+            "transmission = { green = 0.03 }\nhead_limit_mw = { green = 4 }",
+            "transmission.green",
+            "correct transmission",
+        ),
+        ("transmission = { green = 0.0001 }\nhead_limit_mw = { green = 10000 }", "head_limit_mw.green", ""),
+        ("head_limit_mw = { green = 0.9 }", "power_mw.green", "lower it"),
         ("full_power_mw = { red = 9, green = 9, blue = 9 }", "full_power_mw", "ready-beam"),
     ] {
         let [fault] = given(lines).unwrap_err().faults.try_into().unwrap();

@@ -340,7 +340,17 @@ fn text_lasers_are_recognised_put_out_set_lit_and_put_out() {
         if let LaserDriver::Text { transmission_ppb, .. } = &mut behind_a_fibre {
             transmission_ppb[Colour::Green] = 333_333_333;
         }
-        let mut laser = open_laser(&lasers(behind_a_fibre), host_now).unwrap();
+        // By the limit for the panel, which is 500 mW where none is written, it is told this by a slip in the share.
+        let slip = Lasers { power_limit_mw: PerColour([Some(2.0); 3]), ..lasers(behind_a_fibre.clone()) };
+        let mut laser = open_laser(&slip, host_now).unwrap();
+        let refused = laser.program(&program(GREEN), host_now()).unwrap_err();
+        assert!(matches!(refused, LaserError::BeyondHead { colour: Colour::Green, .. }), "{refused}");
+        let foretold = takes(&slip, &program(GREEN), None).unwrap_err();
+        assert_eq!(foretold.to_string(), refused.to_string());
+        assert_eq!(bench.with(|device| device.power_w.clone()), "0.001000", "{name}: and is told nothing");
+        drop(laser);
+        let head_limit_mw = PerColour([None, Some(3.0), None]);
+        let mut laser = open_laser(&Lasers { head_limit_mw, ..slip }, host_now).unwrap();
         laser.program(&program(GREEN), host_now()).unwrap();
         assert_eq!(bench.with(|device| device.power_w.clone()), "0.003000", "{name}");
 

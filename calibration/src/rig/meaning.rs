@@ -165,6 +165,8 @@ pub struct LaserMeaning {
     pub power_limit_mw: PerColourFigures<Option<f64>>,
     /// What the laser itself is told, of those that are told another power than that at the panel.
     pub head_power_mw: PerColourFigures<Option<f64>>,
+    /// Greatest power that the rig allows the laser itself; absent where it says none.
+    pub head_limit_mw: PerColourFigures<Option<f64>>,
     /// The one colour that the panel's mode shows, in monochrome mode.
     pub shown: Option<&'static str>,
     /// What holds in place of a limit that is absent.
@@ -322,7 +324,7 @@ impl FieldMeaning {
 
 impl LaserMeaning {
     fn of(lasers: &Lasers, mode: PanelMode) -> Self {
-        let Lasers { driver, power_mw, power_limit_mw, heartbeat_timeout, stall_timeout, .. } = lasers;
+        let Lasers { driver, power_mw, power_limit_mw, head_limit_mw, heartbeat_timeout, stall_timeout, .. } = lasers;
         let full_power_mw = match driver {
             LaserDriver::ReadyBeam { full_power_uw, .. } => Some(full_power_uw.map(|uw| f64::from(uw) / 1e3).into()),
             _ => None,
@@ -339,6 +341,7 @@ impl LaserMeaning {
                 let head_uw = driver.head_power_uw(colour, Lasers::whole_uw(power_mw[colour]))?;
                 Some(head_uw as f64 / 1e3)
             }),
+            head_limit_mw: of_lasers(&|colour| head_limit_mw[colour]),
             shown: match mode {
                 PanelMode::Monochrome(colour) => Some(colour.name()),
                 PanelMode::ChannelPacked | PanelMode::FieldSequential => None,
@@ -574,7 +577,7 @@ fn notes(rig: &Rig) -> Vec<String> {
     if !at_the_head.is_empty() {
         notes.push(format!(
             "{}: the laser itself is told power_mw, of which fibre, polariser and lenses let less through to the \
-             panel: write into transmission the share that does",
+             panel: write into transmission the share that does, and into head_limit_mw what the laser may be told",
             at_the_head.join(", ")
         ));
     }
@@ -634,8 +637,9 @@ impl fmt::Display for LaserMeaning {
             Some(timeout_ms) => writeln!(f, ", or when one hologram has stayed for {timeout_ms} ms")?,
             None => writeln!(f)?,
         }
-        let [powers_mw, limits_mw, heads_mw] = [self.power_mw, self.power_limit_mw, self.head_power_mw]
-            .map(|PerColourFigures { red, green, blue }| PerColour([red, green, blue]));
+        let [powers_mw, limits_mw, heads_mw, head_limits_mw] =
+            [self.power_mw, self.power_limit_mw, self.head_power_mw, self.head_limit_mw]
+                .map(|PerColourFigures { red, green, blue }| PerColour([red, green, blue]));
         let powers = Colour::ALL.into_iter().filter_map(|colour| {
             let power_mw = powers_mw[colour]?;
             let dark =
@@ -648,7 +652,10 @@ impl fmt::Display for LaserMeaning {
             })
         });
         writeln!(f, "power          {}", powers.collect::<Vec<_>>().join(", "))?;
-        let heads = Colour::ALL.into_iter().filter_map(|colour| Some(format!("{colour} {} mW", heads_mw[colour]?)));
+        let heads = Colour::ALL.into_iter().filter_map(|colour| {
+            let limit = head_limits_mw[colour].map_or(String::new(), |limit_mw| format!(" of at most {limit_mw}"));
+            Some(format!("{colour} {} mW{limit}", heads_mw[colour]?))
+        });
         let heads: Vec<_> = heads.collect();
         if !heads.is_empty() {
             writeln!(f, "at the laser   {}", heads.join(", "))?;

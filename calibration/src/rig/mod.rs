@@ -183,6 +183,9 @@ pub struct Lasers {
     /// Greatest optical power that this bench allows each colour, milliwatts at the panel; not less than `power_mw`.
     /// Where the rig says none, [`Lasers::POWER_MAX_MW`] holds.
     pub power_limit_mw: PerColour<Option<f64>>,
+    /// Greatest power that each laser may be told, milliwatts at the laser itself, where the rig says one. One that
+    /// loses power on the way to the panel always has it, since it is told more than [`Lasers::power_limit_mw`] bounds.
+    pub head_limit_mw: PerColour<Option<f64>>,
     /// From the field's settled phase to the laser's on edge; of lasers that are on while armed, to where a field's own
     /// light is counted from.
     pub on_delay: TimeNs,
@@ -243,6 +246,16 @@ impl Lasers {
     /// The power that no colour exceeds, milliwatts at the panel: the rig's limit, or what holds without one.
     pub fn greatest_power_mw(&self) -> PerColour<f64> {
         self.power_limit_mw.map(|limit_mw| limit_mw.unwrap_or(Self::POWER_MAX_MW))
+    }
+
+    /// The power in microwatts that no laser is told more than, of those that are told their own power
+    /// ([`LaserDriver::head_power_uw`]): the rig's limit, or without one that at the panel.
+    pub fn greatest_head_uw(&self) -> PerColour<u64> {
+        let at_panel_mw = self.greatest_power_mw();
+        PerColour(
+            Colour::ALL
+                .map(|colour| u64::from(Self::whole_uw(self.head_limit_mw[colour].unwrap_or(at_panel_mw[colour])))),
+        )
     }
 }
 
@@ -408,6 +421,7 @@ impl Default for Rig {
                 driver: LaserDriver::Simulated,
                 power_mw: PerColour([1.0; 3]),
                 power_limit_mw: PerColour([None; 3]),
+                head_limit_mw: PerColour([None; 3]),
                 on_delay: TimeNs(100_000),
                 width: TimeNs(3_000_000),
                 heartbeat_timeout: TimeNs(100_000_000),

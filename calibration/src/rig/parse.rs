@@ -77,6 +77,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
             "transmission",
             "power_mw",
             "power_limit_mw",
+            "head_limit_mw",
             "on_delay_ms",
             "lit_ms",
             "heartbeat_timeout_ms",
@@ -722,6 +723,7 @@ fn read_lasers<'a>(
             reader.fault_in(lasers, &format!("power_mw.{colour}"), power.line, &found, &expected, advice);
         }
     }
+    let head_limit_mw = read_head_limits(reader, lasers, driver.as_ref(), power_mw);
     let on_delay_ms = reader.required_number(lasers, "on_delay_ms", ON_DELAY);
     let lit_ms = reader.required_number(lasers, "lit_ms", LIT);
     let heartbeat_ms = reader.required_number(lasers, "heartbeat_timeout_ms", HEARTBEAT);
@@ -788,6 +790,7 @@ fn read_lasers<'a>(
         driver,
         power_mw,
         power_limit_mw: power_limit_mw.map(|limit| limit.map(|limit| limit.value)),
+        head_limit_mw,
         on_delay: milliseconds(on_delay_ms?.value),
         width: milliseconds(lit_ms?.value),
         heartbeat_timeout: milliseconds(heartbeat_ms?.value),
@@ -795,6 +798,64 @@ fn read_lasers<'a>(
         gated_by_panel,
         accept_no_heartbeat,
     })
+}
+
+/// The greatest powers that lasers may be told, none of a driver that is told the power at the panel. A slip in
+/// `transmission` raises what a laser is told and leaves `power_mw` as it is, so that only a limit of its own notices it.
+fn read_head_limits<'a>(
+    reader: &Reader<'a>,
+    lasers: Section<'a>,
+    driver: Option<&LaserDriver>,
+    power_mw: PerColour<Option<Found<f64>>>,
+) -> PerColour<Option<f64>> {
+    const KEY: &str = "head_limit_mw";
+    let needs = |colour: Colour| match driver {
+        Some(driver @ LaserDriver::Text { transmission_ppb, .. }) => {
+            driver.has(colour) && transmission_ppb[colour] < 1_000_000_000
+        }
+        _ => false,
+    };
+    let required = PerColour(Colour::ALL.map(|colour| lasers.has(KEY) && needs(colour)));
+    let limits_mw = reader.numbers(lasers, KEY, FULL_POWER, required);
+    let Some(driver @ LaserDriver::Text { transmission_ppb, .. }) = driver else { return PerColour([None; 3]) };
+    let told_mw = |colour: Colour| {
+        let told_uw = driver.head_power_uw(colour, Lasers::whole_uw(power_mw[colour]?.value))?;
+        Some(told_uw as f64 / 1e3)
+    };
+    let line = reader.line_of_key(lasers, "transmission");
+    let needing: Vec<Colour> = Colour::ALL.into_iter().filter(|&colour| needs(colour)).collect();
+    if !lasers.has(KEY) && !needing.is_empty() {
+        let told = needing.iter().filter_map(|&colour| Some(format!("{} mW for {colour}", told_mw(colour)?)));
+        let told = told.collect::<Vec<_>>().join(", ");
+        let found =
+            if told.is_empty() { "nothing".into() } else { format!("nothing, and lasers would be told {told}") };
+        let expected = "the greatest power that a laser may be told, which transmission makes more than power_mw; \
+                        power_limit_mw is for the panel";
+        let limits = needing.iter().map(|colour| format!("{colour} = ...")).collect::<Vec<_>>().join(", ");
+        let advice = format!(
+            "write head_limit_mw = {{ {limits} }}: what the bench is safe with where nothing is lost on the way, or a \
+             little more than is needed"
+        );
+        reader.fault_in(lasers, KEY, line, &found, expected, advice);
+    }
+    for colour in Colour::ALL {
+        let Some(limit) = limits_mw[colour] else { continue };
+        if !driver.has(colour) {
+            let (key, advice) = (format!("{KEY}.{colour}"), "name its port in devices, or take this out");
+            reader.fault_in(lasers, &key, limit.line, "that of no laser", "a laser of it", advice.into());
+        } else if let Some(told_mw) = told_mw(colour).filter(|told_mw| *told_mw > limit.value) {
+            let share = f64::from(transmission_ppb[colour]) / 1e9;
+            let found = format!("{told_mw} mW that the laser is told, of which {share} gets to the panel");
+            let expected = format!("{} mW at most, as head_limit_mw says", limit.value);
+            let (key, advice) = match lasers.has("transmission") {
+                true => ("transmission", "correct transmission, as measured at the panel, or lower power_mw"),
+                false => ("power_mw", "lower it, or correct head_limit_mw"),
+            };
+            let line = reader.line_of_key(lasers, key);
+            reader.fault_in(lasers, &format!("{key}.{colour}"), line, &found, &expected, advice.into());
+        }
+    }
+    limits_mw.map(|limit| limit.map(|limit| limit.value))
 }
 
 /// The keys of a window, which switches no laser that is on while it is armed.
@@ -832,7 +893,18 @@ const DRIVERS: [(&str, &[&str]); 4] = [
     ("simulated", &[]),
     ("serial", &["device", "sync_wire"]),
     ("ready-beam", &["device", "full_power_mw", "gated_by_panel", "accept_no_heartbeat"]),
-    ("text", &["devices", "profile", "profile_file", "transmission", "gated_by_panel", "accept_no_heartbeat"]),
+    (
+        "text",
+        &[
+            "devices",
+            "profile",
+            "profile_file",
+            "transmission",
+            "head_limit_mw",
+            "gated_by_panel",
+            "accept_no_heartbeat",
+        ],
+    ),
 ];
 
 fn read_driver<'a>(

@@ -202,6 +202,17 @@ pub enum LaserError {
         /// Of both.
         unit: &'static str,
     },
+    /// A laser would be told more than the rig allows, so that its power gets to the panel.
+    #[error(
+        "the {colour} laser would be told {told_mw} mW, and the rig allows it {limit_mw}: correct lasers.transmission, or write lasers.head_limit_mw"
+    )]
+    BeyondHead {
+        colour: Colour,
+        /// What it would be told, milliwatts.
+        told_mw: f64,
+        /// The most that it may be told, milliwatts.
+        limit_mw: f64,
+    },
     /// The box has booted while it was in use.
     #[error("the laser box has reset itself: check its supply and its watchdog")]
     Reset,

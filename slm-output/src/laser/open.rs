@@ -47,8 +47,8 @@ fn serial_options(lasers: &Lasers, sync_wire: bool) -> SerialOptions {
 /// `found` is what a box of holod's protocol says of itself.
 ///
 /// # Errors
-/// What [`LaserBox::program`] says then: [`LaserError::BeyondBox`], [`LaserError::CannotGate`],
-/// [`LaserError::NoLaser`].
+/// What [`LaserBox::program`] says then: [`LaserError::BeyondBox`], [`LaserError::BeyondHead`],
+/// [`LaserError::CannotGate`], [`LaserError::NoLaser`].
 pub fn takes(lasers: &Lasers, program: &LaserProgram, found: Option<&BoxReport>) -> Result<(), LaserError> {
     let has = PerColour(Colour::ALL.map(|colour| lasers.driver.has(colour)));
     match &lasers.driver {
@@ -58,7 +58,10 @@ pub fn takes(lasers: &Lasers, program: &LaserProgram, found: Option<&BoxReport>)
             colours_lit(program, lasers.gated_by_panel, has)?;
             within_powers(program.power_uw, *full_power_uw)
         }
-        LaserDriver::Text { .. } => colours_lit(program, lasers.gated_by_panel, has).map(drop),
+        LaserDriver::Text { .. } => {
+            colours_lit(program, lasers.gated_by_panel, has)?;
+            text_laser::within_head_limits(&lasers.driver, program.power_uw, lasers.greatest_head_uw())
+        }
     }
 }
 

@@ -28,6 +28,8 @@ struct TextLasers {
     lasers: PerColour<Option<TextLaser>>,
     /// What says which power each is told.
     driver: LaserDriver,
+    /// The greatest power that each may be told.
+    head_limit_uw: PerColour<u64>,
 }
 
 /// Opens the lasers at `paths`. Each is recognised before anything else is said to it, and those that are recognised are
@@ -43,7 +45,11 @@ pub(super) fn open(
     clock: fn() -> TimeNs,
 ) -> Result<Box<dyn LaserBox>, LaserError> {
     require_acceptance(lasers)?;
-    let mut open = TextLasers { lasers: PerColour([None, None, None]), driver: lasers.driver.clone() };
+    let mut open = TextLasers {
+        lasers: PerColour([None, None, None]),
+        driver: lasers.driver.clone(),
+        head_limit_uw: lasers.greatest_head_uw(),
+    };
     let mut recognised = Ok(());
     for colour in Colour::ALL {
         if let Some(path) = &paths[colour] {
@@ -158,6 +164,25 @@ impl TextLaser {
     }
 }
 
+/// Whether none of the lasers is told more than `limit_uw` so that `power_uw` of it get to the panel.
+///
+/// # Errors
+/// [`LaserError::BeyondHead`].
+pub(super) fn within_head_limits(
+    driver: &LaserDriver,
+    power_uw: PerColour<u32>,
+    limit_uw: PerColour<u64>,
+) -> Result<(), LaserError> {
+    for colour in Colour::ALL.into_iter().filter(|&colour| driver.has(colour)) {
+        let told_uw = driver.head_power_uw(colour, power_uw[colour]).unwrap_or(0);
+        if told_uw > limit_uw[colour] {
+            let [told_mw, limit_mw] = [told_uw, limit_uw[colour]].map(|uw| uw as f64 / 1e3);
+            return Err(LaserError::BeyondHead { colour, told_mw, limit_mw });
+        }
+    }
+    Ok(())
+}
+
 /// Which answers are right, for messages.
 fn text_of(expect: &Expected) -> String {
     match expect {
@@ -173,6 +198,7 @@ impl PowerDevice for TextLasers {
     }
 
     fn set_power(&mut self, power_uw: PerColour<u32>) -> Result<(), LaserError> {
+        within_head_limits(&self.driver, power_uw, self.head_limit_uw)?;
         for colour in Colour::ALL {
             // One without power is not switched on, and may have no such power.
             let Some(laser) = self.lasers[colour].as_mut().filter(|_| power_uw[colour] > 0) else { continue };
