@@ -34,6 +34,8 @@ struct Device {
     lit_by_mode: bool,
     /// It answers to a change of its mode, and keeps it.
     keeps_mode: bool,
+    /// It knows the command for its mode by another name.
+    knows_no_mode: bool,
     interlock: &'static str,
     mute: bool,
     /// How long it takes to answer.
@@ -168,7 +170,7 @@ fn cobolt() -> Bench {
             }
             "@cobas 0" => "OK".to_owned(),
             "gam?" => device.mode.to_owned(),
-            "cp" => {
+            "cp" if !device.knows_no_mode => {
                 change_mode(device, "1");
                 "OK".to_owned()
             }
@@ -198,7 +200,7 @@ fn obis() -> Bench {
     let bench = Bench::plug_in(b'\n', |device, line| {
         let answer = match line {
             "SOUR:AM:SOUR?" => format!("{}\r\nOK", device.mode),
-            "SOUR:AM:INT CWP" => {
+            "SOUR:AM:INT CWP" if !device.knows_no_mode => {
                 change_mode(device, "CWP");
                 "OK".to_owned()
             }
@@ -530,6 +532,14 @@ fn text_lasers_are_lit_in_the_mode_in_which_their_power_is_in_force_and_in_no_ot
         let error = open_laser(&lasers(driver.clone()), host_now).err().unwrap().to_string();
         assert!(error.contains(&format!("to `{ask}`; expected `{right}`")) && error.contains("mode"), "{error}");
         assert!(!bench.with(|device| device.lit), "{name}: whatever its mode does");
+
+        // One that has another command for it is told so, and taken where it is in that mode already.
+        bench.with(|device| device.knows_no_mode = true);
+        let error = open_laser(&lasers(driver.clone()), host_now).err().unwrap().to_string();
+        assert!(error.contains("another command") && error.contains("lasers.profile_file"), "{error}");
+        let before = bench.with(|device| std::mem::replace(&mut device.mode, right));
+        drop(open_laser(&lasers(driver.clone()), host_now).unwrap());
+        bench.with(|device| (device.knows_no_mode, device.mode) = (false, before));
 
         bench.with(|device| device.keeps_mode = false);
         let mut laser = open_laser(&lasers(driver), host_now).unwrap();

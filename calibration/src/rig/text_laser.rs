@@ -29,7 +29,7 @@ const LAYOUT: [(&str, &[&str]); 5] = [
     ("", &["description", "source", "unverified", "line", "identify", "healthy", "commands"]),
     ("line", &["baud", "end_of_command", "answer_timeout_ms"]),
     ("identify", &["ask", "contains", "one_of", "digits"]),
-    ("healthy", &["ask", "contains", "one_of", "digits"]),
+    ("healthy", &["ask", "contains", "one_of", "digits", "otherwise"]),
     ("commands", &["prepare", "power", "on", "off", "acknowledge", "error"]),
 ];
 
@@ -70,6 +70,9 @@ pub struct Question {
     pub ask: String,
     /// Which answers are right.
     pub expect: Expected,
+    /// The command that brings the laser to where it answers like that, of a question of [`TextLaserProfile::healthy`]. It
+    /// is sent like those of [`TextLaserProfile::prepare`], and only where the answer is another one.
+    pub otherwise: Option<String>,
 }
 
 /// Which answers are right.
@@ -225,12 +228,25 @@ fn questions<'a>(reader: &Reader<'a>, root: Section<'a>, name: &'static str) -> 
         if let Some(ask) = ask {
             sendable(reader, section, "ask", ask.line, ask.value);
         }
+        let otherwise = match name {
+            "healthy" => {
+                reader.text(section, "otherwise", "the command that brings the laser to where it answers like that")
+            }
+            _ => None,
+        };
+        if let Some(otherwise) = otherwise {
+            sendable(reader, section, "otherwise", otherwise.line, otherwise.value);
+        }
         let expect = match (contains, one_of) {
             (Some(text), _) => Expected::Contains(text.value.into()),
             (None, Some(texts)) => Expected::OneOf(texts.value.iter().map(|text| (*text).to_owned()).collect()),
             (None, None) => Expected::Digits,
         };
-        questions.extend(ask.map(|ask| Question { ask: ask.value.into(), expect }));
+        questions.extend(ask.map(|ask| Question {
+            ask: ask.value.into(),
+            expect,
+            otherwise: otherwise.map(|otherwise| otherwise.value.into()),
+        }));
     }
     Some(questions)
 }
@@ -277,6 +293,13 @@ mod tests {
             ("end_of_command = \"\\r\"", "end_of_command = \";\"", "line.end_of_command", "choose one"),
             ("answer_timeout_ms = 500", "answer_timeout_ms = 0.5", "line.answer_timeout_ms", "looks like seconds"),
             ("digits = true", "digits = false", "identify.ask", "which answers"),
+            (
+                "digits = true",
+                "digits = true\notherwise = \"cp\"",
+                "identify.otherwise",
+                "move `otherwise` to [healthy]",
+            ),
+            ("otherwise = \"cp\"", "otherwise = \"cp\\r\"", "healthy.otherwise", "without its line end"),
             ("power = \"p {power_w}\"", "power = \"p\"", "commands.power", "{power_mw}"),
             ("on = [\"l1\"]", "on = []", "commands.on", "at least one"),
             ("on = [\"l1\"]", "on = [\"l1\\r\"]", "commands.on", "without its line end"),

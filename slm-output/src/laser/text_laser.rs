@@ -64,8 +64,7 @@ pub(super) fn open(
     // Whatever is wrong with one of them, no other stays lit.
     let put_out = open.set_lit(NONE_LIT);
     recognised.and(put_out)?;
-    let prepare = |laser: &mut TextLaser| profile.prepare.iter().try_for_each(|command| laser.command(command));
-    let prepared = open.lasers.0.iter_mut().flatten().try_for_each(prepare);
+    let prepared = open.lasers.0.iter_mut().flatten().try_for_each(TextLaser::prepare);
     // One that was lit by that, such as by a change of its mode, does not stay lit.
     let put_out = open.set_lit(NONE_LIT);
     prepared.and(put_out)?;
@@ -115,7 +114,7 @@ impl TextLaser {
         self.profile.identify.clone().iter().try_for_each(|question| self.recognise_by(question))
     }
 
-    fn recognise_by(&mut self, Question { ask, expect }: &Question) -> Result<(), LaserError> {
+    fn recognise_by(&mut self, Question { ask, expect, .. }: &Question) -> Result<(), LaserError> {
         let answer = self.ask(ask)?;
         if expect.accepts(&answer) {
             return Ok(());
@@ -125,11 +124,38 @@ impl TextLaser {
         Err(LaserError::NotABox { path: self.port.path(), found, expected })
     }
 
+    /// Brings the laser, which is dark, to where power alone lights nothing and sets how bright it is. A command for what
+    /// it does already is not sent: it may not know it.
+    fn prepare(&mut self) -> Result<(), LaserError> {
+        self.profile.prepare.clone().iter().try_for_each(|command| self.prepare_by(command))?;
+        for Question { ask, expect, otherwise } in self.profile.healthy.clone() {
+            let Some(command) = otherwise else { continue };
+            if !expect.accepts(&self.ask(&ask)?) {
+                self.prepare_by(&command)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn prepare_by(&mut self, command: &str) -> Result<(), LaserError> {
+        self.command(command).map_err(|why| match why {
+            LaserError::Complaint { path, sent, found, expected } => {
+                let expected = format!(
+                    "{expected}: where this laser has another command for that, copy its profile, which is \
+                     among the documentation's examples, write the command there, and name the copy in \
+                     lasers.profile_file"
+                );
+                LaserError::Complaint { path, sent, found, expected }
+            }
+            other => other,
+        })
+    }
+
     fn check(&mut self) -> Result<(), LaserError> {
         self.profile.healthy.clone().iter().try_for_each(|question| self.check_by(question))
     }
 
-    fn check_by(&mut self, Question { ask, expect }: &Question) -> Result<(), LaserError> {
+    fn check_by(&mut self, Question { ask, expect, .. }: &Question) -> Result<(), LaserError> {
         let found = self.ask(ask)?;
         if expect.accepts(&found) {
             return Ok(());
