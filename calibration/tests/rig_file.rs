@@ -1058,13 +1058,36 @@ fn a_table_of_few_levels_that_steps_back_a_little_is_a_fault() {
     let [fault] = load_sparse_lut(&table(0.004)).unwrap_err().faults.try_into().unwrap();
     assert_eq!(fault.key, "panel.lut_file.green");
     assert!(fault.found.contains("phase 0 at level 0, phase -0.004 at level 8"), "{fault}");
-    assert_eq!(fault.advice, "smooth the measurement, or leave out level 8");
+    assert!(fault.advice.starts_with("smooth the measurement, or leave out level 8; `holod lut`"), "{fault}");
     let smooth: String =
         table(0.004).lines().filter(|row| !row.starts_with("8,")).map(|row| format!("{row}\n")).collect();
     let told = load_sparse_lut(&smooth).unwrap().warnings();
     assert!(!told.iter().any(|told| told.contains("phase_sign")), "{told:?}");
-    // Steps back of a tenth of the range are an order of its own.
-    let told = load_sparse_lut(&table(0.8)).unwrap().warnings();
+    // The more noise, the more rows step back, and none of them is an order of its own.
+    let mut state = 1u64;
+    let mut noise = move || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as f64 / f64::from(1u32 << 31) - 0.5
+    };
+    for (noise_rad, rows_back_min) in [(0.04, 10), (0.08, 30), (0.16, 60)] {
+        let of_255: Vec<f64> =
+            (0..255).map(|level| f64::from(level) * 2.2 * PI / 255.0 + noise_rad * noise()).collect();
+        let back = of_255.windows(2).filter(|pair| pair[1] < pair[0]).count();
+        assert!(back >= rows_back_min, "{noise_rad}: {back}");
+        let csv: String = of_255.iter().enumerate().map(|(level, phase)| format!("{level},{phase}\n")).collect();
+        let [fault] = load_sparse_lut(&csv).unwrap_err().faults.try_into().unwrap();
+        assert!(fault.found.contains(&format!("the first of {back} rows that step back")), "{fault}");
+        assert!(fault.advice.contains("`holod lut`") && !fault.advice.contains("leave out"), "{fault}");
+    }
+    // In no order there is as much back as forward.
+    for step in [7, 101, 150] {
+        let csv: String =
+            (0..255).map(|level| format!("{level},{}\n", f64::from(level * step % 255) * 0.026)).collect();
+        let told = load_sparse_lut(&csv).unwrap().warnings();
+        assert!(told.iter().any(|told| told.contains("phase_sign is not applied")), "{step}: {told:?}");
+    }
+    // Of few rows one step back is an order.
+    let told = load_sparse_lut("0,0\n60,2\n120,1\n180,4\n255,6\n").unwrap().warnings();
     assert!(told.iter().any(|told| told.contains("phase_sign is not applied")), "{told:?}");
 }
 

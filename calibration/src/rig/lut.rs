@@ -12,9 +12,13 @@ const ROWS_QUOTED_MAX: usize = 3;
 const PHASE_MAX_RAD: f64 = 16.0 * PI;
 /// Tables of the first 2^k levels are those of a panel with k bits from so many on.
 const OTHER_DEPTH_MIN: usize = 64;
-/// A table of some levels that steps back by no more than this share of its range in all is one in order, measured with
-/// some noise.
-const NOISE_SHARE_MAX: f64 = 0.05;
+/// A table of some levels whose steps back are no more than this share of those forward is one in order, measured with
+/// some noise: in no order the two are about the same.
+const NOISE_SHARE_MAX: f64 = 0.6;
+/// The same of a table of few rows, whose steps are larger than noise, so that one back is soon an order of its own.
+const FEW_ROWS_NOISE_SHARE_MAX: f64 = 0.05;
+/// Tables of fewer rows have few.
+const FEW_ROWS: usize = 16;
 /// A panel of one level shows nothing.
 const LEVELS_MIN: usize = 2;
 
@@ -24,7 +28,7 @@ const LEVELS_MIN: usize = 2;
 /// - every level: a row for each from 0 up, `level,phase_rad` or `phase_rad` alone. The phase may rise or fall with the
 ///   level but not both.
 /// - some levels, for a panel with few and irregular ones: a row `level,phase_rad` for each that may be used, the
-///   levels rising, the phases in any order. Phases that are in order but for little steps back are noise, and a fault:
+///   levels rising, the phases in any order. Phases that are in order but for steps back are noise, and a fault:
 ///   in any order neither the sign nor the first turn of several can be told.
 ///
 /// # Errors
@@ -85,18 +89,25 @@ pub(super) fn read(path: &Path, text: &str, bit_depth: u8) -> Result<Vec<LevelPh
     let turns_round = |pair: &[LevelPhase]| {
         if falls { pair[1].phase_rad > pair[0].phase_rad } else { pair[1].phase_rad < pair[0].phase_rad }
     };
-    let phases_rad = || table.iter().map(|entry| entry.phase_rad);
-    let range_rad = phases_rad().fold(f64::MIN, f64::max) - phases_rad().fold(f64::MAX, f64::min);
     let steps_back = || table.windows(2).filter(|pair| turns_round(pair));
-    let back_rad: f64 = steps_back().map(|pair| (pair[1].phase_rad - pair[0].phase_rad).abs()).sum();
-    if let Some(broken) = steps_back().next().filter(|_| complete || back_rad <= NOISE_SHARE_MAX * range_rad) {
+    let length_rad = |pair: &[LevelPhase]| (pair[1].phase_rad - pair[0].phase_rad).abs();
+    let back_rad: f64 = steps_back().map(length_rad).sum();
+    let forward_rad = table.windows(2).map(length_rad).sum::<f64>() - back_rad;
+    let noise_share_max = if table.len() < FEW_ROWS { FEW_ROWS_NOISE_SHARE_MAX } else { NOISE_SHARE_MAX };
+    if let Some(broken) = steps_back().next().filter(|_| complete || back_rad <= noise_share_max * forward_rad) {
         let [before, after] =
             [broken[0], broken[1]].map(|LevelPhase { level, phase_rad }| format!("phase {phase_rad} at level {level}"));
-        let advice = match complete {
-            true => "smooth the measurement or unwrap its phase".to_owned(),
-            false => format!("smooth the measurement, or leave out level {}", broken[1].level),
+        let back = steps_back().count();
+        let more = if back > 1 { format!(", the first of {back} rows that step back") } else { String::new() };
+        let advice = match (complete, back) {
+            (true, _) => "smooth the measurement or unwrap its phase; ".to_owned(),
+            (false, 1) => format!("smooth the measurement, or leave out level {}; ", broken[1].level),
+            (false, _) => "smooth the measurement; ".to_owned(),
         };
-        return Err(fault(format!("{before}, {after}"), &advice));
+        return Err(fault(
+            format!("{before}, {after}{more}"),
+            &(advice + "`holod lut` makes a smooth table from measured powers"),
+        ));
     }
     Ok(table)
 }
