@@ -669,6 +669,8 @@ fn with_driver(lines: &str) -> Result<Rig, RigError> {
 }
 
 const ACCEPTED: &str = "accept_no_heartbeat = \"these lasers stay lit when holod dies\"";
+/// What lights lasers that cannot be switched for single fields in channel-packed mode.
+const GATED: &str = "gated_by_panel = true";
 
 #[test]
 fn lasers_without_a_heartbeat_are_taken_only_where_the_rig_accepts_that_in_words() {
@@ -677,12 +679,12 @@ fn lasers_without_a_heartbeat_are_taken_only_where_the_rig_accepts_that_in_words
     let text = "driver = \"text\"\nprofile = \"cobolt\"\ndevices = { green = \"/dev/g\", blue = \"/dev/b\" }";
     for lines in [ready_beam, text] {
         for words in ["", "\naccept_no_heartbeat = \"yes\""] {
-            let error = with_driver(&format!("{lines}{words}")).unwrap_err();
+            let error = with_driver(&format!("{lines}\n{GATED}{words}")).unwrap_err();
             let [fault] = error.faults.as_slice() else { panic!("{error}") };
             assert_eq!(fault.key, "lasers.accept_no_heartbeat");
             assert!(fault.advice.contains("these lasers stay lit when holod dies"), "{fault}");
         }
-        let rig = with_driver(&format!("{lines}\n{ACCEPTED}\ngated_by_panel = true")).unwrap();
+        let rig = with_driver(&format!("{lines}\n{ACCEPTED}\n{GATED}")).unwrap();
         assert!(!rig.lasers.driver.has_heartbeat() && rig.lasers.accept_no_heartbeat && rig.lasers.gated_by_panel);
         match rig.lasers.driver {
             LaserDriver::ReadyBeam { path, full_power_uw } => {
@@ -728,6 +730,9 @@ fn lasers_that_are_on_while_armed_are_lit_all_the_time() {
     let windowless = rig(&[GREEN_ALONE, ("driver = \"simulated\"", &alone), windowless[0], windowless[1]]);
     assert_eq!(windowless.meaning().field, meaning.field);
     assert!(!windowless.meaning().to_string().contains("is cut"));
+    // Nor is one judged that is there.
+    let long = rig(&[GREEN_ALONE, ("driver = \"simulated\"", &alone), ("lit_ms = 3.0", "lit_ms = 20")]);
+    assert_eq!((long.meaning().field, long.lasers), (windowless.meaning().field, windowless.lasers));
     let asked = faults_of(&changed(&[("lit_ms = 3.0\n", "")]));
     assert_eq!(asked[0].key, "lasers.lit_ms", "of lasers that are lit field by field");
 
@@ -741,7 +746,7 @@ fn lasers_that_are_on_while_armed_are_lit_all_the_time() {
     assert!(alone.notes.iter().any(|note| note.starts_with("gated_by_panel is without effect")), "{:?}", alone.notes);
     // Of several lasers one is shown in this mode.
     let all = rig(&[GREEN_ALONE]).meaning().to_string();
-    assert!(all.contains("lit for 18 % of it, each colour for 18 % of the time"), "{all}");
+    assert!(all.contains("lit for 18 % of it, green for 18 % of the time"), "{all}");
     assert!(rig(&[]).meaning().to_string().contains("lit for 54 % of it, each colour for 18 % of the time"));
     assert!(all.contains("red 1 mW without a power_limit_mw (500 at most), not lit in this mode, green 1 mW"), "{all}");
 }
@@ -763,6 +768,29 @@ fn what_a_panel_does_in_channel_packed_mode_alone_is_refused_in_the_others() {
         assert!(fault.advice.contains(advice), "{}", fault.advice);
         with_driver(lines).unwrap();
     }
+    // A laser that has no such key is told of that alone.
+    for mode in [
+        SEQUENTIAL,
+        ("field_order = [\"red\"", "channel_order = [\"green\", \"red\", \"blue\"]\nfield_order = [\"red\""),
+    ] {
+        let text = changed(&[
+            mode,
+            ("driver = \"simulated\"", "driver = \"serial\"\ndevice = \"/dev/x\"\ngated_by_panel = true"),
+        ]);
+        let [fault] = faults_of(&text).try_into().unwrap();
+        assert!(fault.key == "lasers.gated_by_panel" && fault.found.contains("does not have"), "{}", fault.found);
+    }
+    // Nor can these be lit at all where nothing switches them for single fields.
+    let bare = format!("{beam}\n{ACCEPTED}");
+    for (modes, words) in [
+        (&[("driver = \"simulated\"", bare.as_str())][..], &["gated_by_panel = true", "monochrome"][..]),
+        (&[SEQUENTIAL, ("driver = \"simulated\"", &bare)], &["monochrome"]),
+    ] {
+        let [fault] = faults_of(&changed(modes)).try_into().unwrap();
+        assert_eq!((fault.key.as_str(), fault.line.is_some()), ("lasers.driver", true));
+        assert!(words.iter().all(|word| fault.advice.contains(word)), "{}", fault.advice);
+        assert_eq!(fault.advice.contains("gated_by_panel"), words.len() == 2, "{}", fault.advice);
+    }
     let late =
         changed(&[SEQUENTIAL, ("refresh_hz = 60.0", "refresh_hz = 180.0"), ("settle_ms = 2.0", "settle_ms = 7.5")]);
     let [fault] = faults_of(&late).try_into().unwrap();
@@ -772,7 +800,7 @@ fn what_a_panel_does_in_channel_packed_mode_alone_is_refused_in_the_others() {
 #[test]
 fn a_laser_is_told_what_brings_its_power_to_the_panel() {
     let text = "driver = \"text\"\nprofile = \"cobolt\"\ndevices = { green = \"/dev/g\", blue = \"/dev/b\" }";
-    let given = |lines: &str| with_driver(&format!("{text}\n{lines}\n{ACCEPTED}"));
+    let given = |lines: &str| with_driver(&format!("{text}\n{lines}\n{ACCEPTED}\n{GATED}"));
     let rig = given("transmission = { green = 0.3 }\nhead_limit_mw = { green = 4 }").unwrap();
     let driver = &rig.lasers.driver;
     let told = |colour, uw| driver.head_power_uw(colour, uw).unwrap();
@@ -1611,7 +1639,8 @@ fn colours_that_are_never_seen_have_no_light() {
     assert_eq!(light(&[]), [1.0; 3]);
     assert_eq!(light(&[("\"channel-packed\"", "\"monochrome\"\ncolour = \"green\"")]), [0.0, 1.0, 0.0]);
     assert_eq!(light(&[("green = 1.0", "green = 0")]), [1.0, 0.0, 1.0]);
-    let one = format!("driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ green = \"/dev/g\" }}\n{ACCEPTED}");
+    let one =
+        format!("driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ green = \"/dev/g\" }}\n{ACCEPTED}\n{GATED}");
     assert_eq!(with_driver(&one).unwrap().light().0, [0.0, 1.0, 0.0]);
 }
 
@@ -1663,8 +1692,9 @@ fn meaning_says_the_lasers_powers_and_what_bounds_them() {
     assert_eq!(json["lasers"]["power_limit_mw"], json!({"red": null, "green": 1.0, "blue": null}));
     assert_eq!(json["lasers"]["power_max_mw"], json!(500.0));
     // Of lasers that are not there nothing is asked, and of simulated ones no limit.
-    let one =
-        meaning(&format!("driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ green = \"/dev/g\" }}\n{ACCEPTED}"));
+    let one = meaning(&format!(
+        "driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ green = \"/dev/g\" }}\n{ACCEPTED}\n{GATED}"
+    ));
     assert!(is_noted(&one, "green"), "{:?}", one.notes);
     // Nor is the stop set for one: λ·F/2p of 520 nm, 8 µm and 100 mm.
     let is_set_for = |meaning: &Meaning, text: &str| meaning.notes.iter().any(|note| note.contains(text));
@@ -1674,7 +1704,7 @@ fn meaning_says_the_lasers_powers_and_what_bounds_them() {
     assert!(!Rig::default().meaning().notes.iter().any(|note| note.contains(unlimited)));
     let beam = meaning(&format!(
         "driver = \"ready-beam\"\ndevice = \"/dev/b\"\n\
-         full_power_mw = {{ red = 40, green = 30.5, blue = 50 }}\n{ACCEPTED}"
+         full_power_mw = {{ red = 40, green = 30.5, blue = 50 }}\n{ACCEPTED}\n{GATED}"
     ));
     assert!(beam.to_string().contains("at 100 %       red 40, green 30.5, blue 50 mW\n"), "{beam}");
     let tracked = Rig::parse(

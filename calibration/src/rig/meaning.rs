@@ -740,8 +740,9 @@ impl fmt::Display for Meaning {
         match (field.laser_on_ms, field.laser_off_ms, field.lit_share, field.time_share) {
             (Some(on_ms), Some(off_ms), Some(lit_share), Some(time_share)) => writeln!(
                 f,
-                ", laser on at {on_ms:.3}, off at {off_ms:.3}: lit for {:.0} % of it, each colour for {:.0} % of the time",
+                ", laser on at {on_ms:.3}, off at {off_ms:.3}: lit for {:.0} % of it, {} for {:.0} % of the time",
                 lit_share * 100.0,
+                self.lasers.shown.unwrap_or("each colour"),
                 time_share * 100.0
             )?,
             (.., None) => writeln!(f, "; lit as the panel gates the lasers, whatever on_delay_ms and lit_ms say")?,

@@ -186,8 +186,7 @@ pub struct Lasers {
     /// Greatest power that each laser may be told, milliwatts at the laser itself, where the rig says one. One that
     /// loses power on the way to the panel always has it, since it is told more than [`Lasers::power_limit_mw`] bounds.
     pub head_limit_mw: PerColour<Option<f64>>,
-    /// From the field's settled phase to the laser's on edge; of lasers that are on while armed, to where a field's own
-    /// light is counted from.
+    /// From the field's settled phase to the laser's on edge; 0 for lasers that are on while armed, whatever the rig says.
     pub on_delay: TimeNs,
     /// Length of the lit window within a field, or of what is counted of it.
     pub width: TimeNs,

@@ -700,6 +700,8 @@ fn read_lasers<'a>(
         None => [lasers.has("devices"), lasers.has("devices") || lasers.has("full_power_mw")],
     };
     let is_there = |colour: Colour| driver.as_ref().map_or(!may_lack_lasers, |driver| driver.has(colour));
+    // Of a driver that does not have the key that is a fault already.
+    let gated_by_panel = gated_by_panel && may_be_on;
     let lasers = if may_be_on { lasers.excusing(&WINDOW_KEYS) } else { lasers };
     let power_mw = reader.numbers(lasers, "power_mw", POWER, PerColour(Colour::ALL.map(is_there)));
     let power_limit_mw = reader.numbers(lasers, "power_limit_mw", POWER, PerColour([false; 3]));
@@ -741,14 +743,14 @@ fn read_lasers<'a>(
         reader.fault_in(lasers, "gated_by_panel", line, &found, &expected, advice);
     }
     check_mode(reader, lasers, timing, driver.as_ref(), gated_by_panel);
-    let left_out = |key: &str| may_be_on && !lasers.has(key);
-    let on_delay_ms = on_delay_ms.or(left_out("on_delay_ms").then_some(Found { value: 0.0, line: None }));
+    // Where no window switches lasers, what is lit of a field begins when its phase has settled, whatever is written.
+    let windowless = |value: f64| Some(Found { value, line: None });
+    let on_delay_ms = if may_be_on { windowless(0.0) } else { on_delay_ms };
     let room_ms = |timing: FieldTiming, on_delay_ms: Found<f64>| {
         timing.field_ms - timing.slack_ms() - timing.settle_ms.value - on_delay_ms.value
     };
-    // Where no window switches lasers, what is lit of a field begins when its phase has settled.
-    let whole_field = || Some(Found { value: room_ms(timing?, on_delay_ms?).max(LIT.min), line: None });
-    let lit_ms = lit_ms.or_else(|| left_out("lit_ms").then(whole_field).flatten());
+    let whole_field = || windowless(room_ms(timing?, on_delay_ms?).max(LIT.min));
+    let lit_ms = if may_be_on { whole_field() } else { lit_ms };
     if let (Some(timing), Some(on_delay_ms), Some(lit_ms)) = (timing, on_delay_ms, lit_ms) {
         let before_ms = timing.settle_ms.value + on_delay_ms.value;
         let end_ms = before_ms + lit_ms.value;
@@ -765,6 +767,8 @@ fn read_lasers<'a>(
             let expected = format!("an end within the {}, {slack} ms before its own", timing.describe_field());
             let advice = if room_ms >= LIT.min {
                 format!("write lit_ms = {} at most", (room_ms * 1e3).floor() / 1e3)
+            } else if may_be_on {
+                "lower panel.refresh_hz, or correct panel.settle_ms".into()
             } else {
                 "shorten on_delay_ms or lower panel.refresh_hz".into()
             };
@@ -869,9 +873,29 @@ fn check_mode<'a>(
     driver: Option<&LaserDriver>,
     gated_by_panel: bool,
 ) {
-    let Some(mode) = timing.map(|timing| timing.mode).filter(|&mode| mode != PanelMode::ChannelPacked) else { return };
-    let found = format!("true in {} mode", mode.name());
+    let Some(mode) = timing.map(|timing| timing.mode) else { return };
     let packed = PanelMode::ChannelPacked.name();
+    let is_of_one_colour = matches!(mode, PanelMode::Monochrome(_));
+    if let Some(driver) = driver.filter(|driver| !driver.gates_fields() && !is_of_one_colour && !gated_by_panel) {
+        let line = reader.line_of_key(lasers, "driver");
+        let found =
+            format!("\"{}\" in {} mode, whose fields these lasers cannot be switched for", driver.name(), mode.name());
+        let by_panel = match mode {
+            PanelMode::ChannelPacked => {
+                "write gated_by_panel = true where the panel's own hardware gates each laser to its \
+                                         field, or "
+            }
+            _ => "",
+        };
+        let advice = format!(
+            "{by_panel}show one colour (mode = \"monochrome\"), or light fields with a laser box (driver = \"serial\")"
+        );
+        reader.fault_in(lasers, "driver", line, &found, "lasers that can be lit for single fields", advice);
+    }
+    if mode == PanelMode::ChannelPacked {
+        return;
+    }
+    let found = format!("true in {} mode", mode.name());
     if mode == PanelMode::FieldSequential && gated_by_panel {
         let line = reader.line_of_key(lasers, "gated_by_panel");
         let expected = format!("false, or mode = \"{packed}\": of a video frame of one colour only holod knows which");

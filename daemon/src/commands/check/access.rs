@@ -307,7 +307,7 @@ mod tests {
         fs::write(path("eye.txt"), "").unwrap();
         let text = Rig::BUILT_IN_TOML.replace(
             "driver = \"simulated\"",
-            "driver = \"text\"\nprofile_file = \"lasers.toml\"\ndevices = { green = \"/dev/x\" }\n\
+            "driver = \"text\"\nprofile_file = \"lasers.toml\"\ndevices = { green = \"/dev/x\" }\ngated_by_panel = true\n\
              accept_no_heartbeat = \"these lasers stay lit when holod dies\"",
         );
         fs::write(path("rig.toml"), format!("{text}\n")).unwrap();
