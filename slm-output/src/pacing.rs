@@ -18,11 +18,13 @@ const WINDOW: usize = 192;
 /// longest: one or two hiccups among many frames do not move it. At 60 frames a second that is the 98.4th percentile.
 const FRAMES_A_RANK: usize = 10;
 const RANK: usize = 3;
+/// So many of the last frames say what the next one takes that follows a rest.
+const NEWEST: usize = RANK * FRAMES_A_RANK;
 /// Of frames that take several refreshes there are few in this time, and a rare long one must not slow all of them for
 /// longer: to be late by a refresh costs such a frame less than to wait for it costs all others.
 const FORGOTTEN_AFTER: TimeNs = TimeNs(3_200_000_000);
 /// Where fewer than [`FRAMES_A_RANK`] frames are remembered, one that took longer than the newest by this factor was a
-/// standstill, which says nothing of the next ones.
+/// standstill, which says nothing of the next ones; at rest one that took longer than the median by it.
 const STANDSTILL_FACTOR: i64 = 4;
 /// Share of a refresh's error that moves the phase, and that moves the period, of the panel's clock.
 const PHASE_GAIN: f64 = 0.1;
@@ -317,17 +319,26 @@ impl FrameTimes {
         Self { window: [none; WINDOW], count: 0, estimate: first }
     }
 
-    /// Frames took no work lately. Once all that is remembered is old, a hiccup among it must not slow them any more:
-    /// what they take is the median.
+    /// Frames took no work lately. Once all that is remembered is old, a hiccup among it must not slow them any more,
+    /// and the next one that takes work is still to be in time: what they take is the second longest of the newest
+    /// ones, or the third longest where they are many, without standstills.
     fn rest(&mut self, now: TimeNs) {
-        let known = self.count.min(WINDOW);
-        let is_old = |frame: &FrameTime| now.0.saturating_sub(frame.t_submit.0) > FORGOTTEN_AFTER.0;
-        if known == 0 || !self.window[..known].iter().all(is_old) {
-            return;
+        let known = self.count.min(NEWEST);
+        let mut newest = [TimeNs(0); NEWEST];
+        for (time, count) in newest.iter_mut().zip(self.count - known..self.count) {
+            let frame = &self.window[count % WINDOW];
+            if now.0.saturating_sub(frame.t_submit.0) <= FORGOTTEN_AFTER.0 {
+                return;
+            }
+            *time = frame.time;
         }
-        let mut times = self.window.map(|frame| frame.time);
-        times[..known].sort_unstable();
-        self.estimate = times[(known - 1) / 2];
+        let times = &mut newest[..known];
+        times.sort_unstable();
+        let Some(&median) = times.get(known.saturating_sub(1) / 2) else { return };
+        let longest = TimeNs(median.0.saturating_mul(STANDSTILL_FACTOR));
+        let usual = times.partition_point(|&time| time <= longest);
+        let rank = (usual / FRAMES_A_RANK).clamp(1, RANK - 1);
+        self.estimate = times[usual.saturating_sub(rank + 1)];
     }
 
     fn push(&mut self, time: TimeNs, t_submit: TimeNs) {
@@ -656,7 +667,51 @@ mod tests {
         }
         assert!((TimeNs(0)..TimeNs(2 * REFRESH.0)).contains(&(now - t_hiccup - FORGOTTEN_AFTER)), "{now:?}");
         assert!((60..70).contains(&frames), "every third refresh: {frames}");
-        assert_eq!(pacer.budget(), TimeNs(6 * MS));
+        assert_eq!(pacer.budget(), TimeNs(6 * MS), "the second longest without the standstill");
+    }
+
+    /// From 8 to 14 ms each, as often the one as the other.
+    #[test]
+    fn the_first_frame_after_a_rest_comes_in_time() {
+        let mut pacer = Pacer::new(config(), TimeNs(0));
+        let mut random = Pcg64Mcg::seed_from_u64(4);
+        let (mut now, mut late) = (TimeNs(MS), 0);
+        for _ in 0..200 {
+            for number in 0..12 {
+                let plan = pacer.predict(now);
+                now = plan.t_wake + TimeNs(random.random_range(8 * MS..14 * MS));
+                pacer.submitted(plan.frame_id, now);
+                late += u32::from(number == 0 && now + config().submit_margin > plan.t_desired_present);
+            }
+            let t_rested = now + FORGOTTEN_AFTER + TimeNs(500 * MS);
+            while now < t_rested {
+                let plan = pacer.predict(now);
+                now = plan.t_wake + TimeNs(MS / 10);
+                pacer.submitted_at_once(plan.frame_id, now);
+            }
+        }
+        assert!((5..30).contains(&late), "{late} of 200");
+    }
+
+    #[test]
+    fn a_rest_leaves_out_standstills_and_the_longest_of_the_others() {
+        let after = |times_ms: &[i64]| {
+            let mut times = FrameTimes::new(TimeNs(MS));
+            for (number, time_ms) in (1..).zip(times_ms) {
+                times.push(TimeNs(time_ms * MS), TimeNs(number * 20 * MS));
+            }
+            times.rest(TimeNs(60_000 * MS));
+            times.estimate.0 / MS
+        };
+        assert_eq!(after(&[]), 1, "nothing is known but what was given");
+        assert_eq!(after(&[7]), 7);
+        assert_eq!(after(&[7, 9]), 7);
+        assert_eq!(after(&[5, 6, 19, 5]), 6, "less than a standstill");
+        assert_eq!(after(&[5, 6, 400, 7]), 6);
+        let mut many = vec![50; 200];
+        many.extend([5; 26]);
+        many.extend([300, 8, 7, 6]);
+        assert_eq!(after(&many), 6, "of the newest alone");
     }
 
     #[test]
