@@ -170,6 +170,16 @@ def test_orders_and_troubles_are_in_the_log(page: Holod, browser: webdriver.Chro
     assert "samples" in text(browser, "counters")
 
 
+def test_a_run_in_which_nothing_changes_is_told_as_that(page: Holod, browser: webdriver.Chrome) -> None:
+    wait_for("light is told", lambda: "median since the tracker’s sample" in text(browser, "latency-text"))
+    wait_for("the engine's time is told", lambda: "computed in 10 s; the engine takes" in text(browser, "stages-text"))
+    page.ctl("pupil", "5")
+    wait_for("no latency is told", lambda: text(browser, "latency-text") == "nothing new in 10 s")
+    assert ", none of them computed in 10 s: there was nothing new; " in text(browser, "stages-text")
+    wait_for("fields are lit all the same", lambda: pixels(browser, "fields", "green") > 50)
+    assert faults(browser) == []
+
+
 def test_a_daemon_that_hangs_is_told(page: Holod, browser: webdriver.Chrome) -> None:
     page.process.send_signal(signal.SIGSTOP)
     wait_for("its silence is told", lambda: "holod has said nothing for" in text(browser, "alert"))

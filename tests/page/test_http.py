@@ -307,4 +307,5 @@ def test_a_stream_begins_with_the_state_and_what_was(start: Start) -> None:
     assert fields, batches
     for number, _, t_present, t_end, on, off, _ in fields:
         assert frames[number][1] < t_present < t_end
+        assert frames[number][7] in (True, False)
         assert on is None or t_present < on < off < t_end

@@ -171,7 +171,7 @@ pub(super) struct Batch {
 pub(super) struct TakenSample(pub(super) f64, pub(super) char, pub(super) f32, pub(super) Option<&'static str>);
 
 /// Number, when the loop woke, the pupil in millimetres, what that rests on, and milliseconds to the engine's start, to
-/// its end, to the submission.
+/// its end, to the submission; whether its levels were computed.
 #[derive(Serialize)]
 pub(super) struct MadeFrame(
     pub(super) u64,
@@ -181,6 +181,7 @@ pub(super) struct MadeFrame(
     pub(super) f64,
     pub(super) f64,
     pub(super) f64,
+    pub(super) bool,
 );
 
 /// Frame, colour from red, from, until, its laser's from and until, and what is remarkable about it.

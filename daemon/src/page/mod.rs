@@ -109,6 +109,7 @@ impl Observer for Page {
             milliseconds(record.t_wake, record.t_render_begin),
             milliseconds(record.t_render_begin, record.t_render_end),
             milliseconds(record.t_render_end, record.t_submit),
+            record.is_computed,
         ));
         Ok(())
     }

@@ -147,6 +147,7 @@ function tellFacts(snapshot) {
     ["Tracker’s trouble", snapshot.tracker_trouble],
     ["Pupil", `${number(snapshot.pupil_mm, 2)} mm, ${snapshot.pupil_state || "not known yet"}; eye: ${snapshot.eye}`],
     ["Frames shown", `${snapshot.frames_shown}, ${number(snapshot.frames_shown_hz)} a second of ${number(snapshot.panel_frames_hz)}`],
+    ["Frames computed", `${snapshot.frames_computed} of ${snapshot.frames_made} made`],
     ["Late frames", String(snapshot.deadline_misses)],
     ["Advice", snapshot.speed_advice],
     ["Frame time", spread(snapshot.frame_time)],
@@ -267,14 +268,18 @@ function drawLatency() {
   plot.end();
 }
 
+/** Milliseconds before, in and after the engine. */
+const stagesOf = (frame) => frame.slice(4, 7);
+
 function drawStages() {
   const plot = plots.stages;
-  const high = roundUp(Math.max(2, ...seen.frames.map(([, , , , ...stages]) => stages.reduce((sum, ms) => sum + ms))));
+  const high = roundUp(Math.max(2, ...seen.frames.map((frame) => stagesOf(frame).reduce((sum, ms) => sum + ms))));
   overTime(plot, high, "ms");
-  seen.frames.forEach(([, t, , , ...stages], index) => {
+  seen.frames.forEach((frame, index) => {
+    const t = frame[1];
     const next = seen.frames[index + 1]?.[1] ?? t + 0.016;
     let from = 0;
-    stages.forEach((ms, stage) => {
+    stagesOf(frame).forEach((ms, stage) => {
       plot.box(t, Math.min(next, t + 0.1), from, from + ms, ["before", "engine", "after"][stage]);
       from += ms;
     });
@@ -306,6 +311,12 @@ function drawFields() {
 const quantile = (values, share) => values.toSorted((a, b) => a - b)[Math.floor(values.length * share)];
 const median = (values) => quantile(values, 0.5);
 
+/** Why light has no latency: none follows a sample or a live picture, which only what is computed does. */
+function noLatency(isLit, isComputed) {
+  if (!isLit) return `no light in ${WINDOW_S} s`;
+  return isComputed ? "the light follows no sample and no live picture" : `nothing new in ${WINDOW_S} s`;
+}
+
 function tellFigures() {
   const { samples, frames, light, fields } = seen;
   const refused = samples.filter(([, , , reason]) => reason !== null);
@@ -317,9 +328,12 @@ function tellFigures() {
     const values = light.map((row) => row[index + 1]).filter((ms) => ms !== null);
     return values.length ? `${number(median(values))} ms median since the ${since}, ${number(Math.max(...values))} ms at most` : "";
   });
-  put(at("latency-text"), told.filter(Boolean).join("; ") || "no light yet");
+  const computed = frames.filter((frame) => frame[7]);
+  put(at("latency-text"), told.filter(Boolean).join("; ") || noLatency(light.length > 0, computed.length > 0));
   const late = new Set(fields.filter((field) => field[6] === "late").map(([frame]) => frame)).size;
-  put(at("stages-text"), frames.length ? `${number(frames.length / WINDOW_S)} frames a second; the engine takes ${number(median(frames.map((frame) => frame[5])))} ms; ${late} late on the panel` : "no frame yet");
+  const engine = computed.length ? `${computed.length} of them computed in ${WINDOW_S} s; the engine takes ${number(median(computed.map((frame) => frame[5])))} ms` :
+    `none of them computed in ${WINDOW_S} s: there was nothing new`;
+  put(at("stages-text"), frames.length ? `${number(frames.length / WINDOW_S)} frames a second, ${engine}; ${late} late on the panel` : "no frame yet");
   const lit = fields.filter((field) => field[5] !== null);
   const dark = [...new Set(fields.filter((field) => field[5] === null).map((field) => field[6]).filter(isReason))];
   const share = fields.length ? lit.reduce((sum, field) => sum + field[5] - field[4], 0) / fields.reduce((sum, field) => sum + field[3] - field[2], 0) : 0;
