@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use holod_tests::daemon::{Daemon, Ended, wait_until};
+use holod_tests::frames::FieldRow;
 use holod_tests::{diverged_weights, frames, small_rig};
 use rustix::process::Signal;
 use serde_json::{Value, json};
@@ -251,7 +252,7 @@ fn the_rig_file_is_read_again_and_taken_whole_or_not_at_all() {
     bench.until("the right eye is followed", |status| status["pupil_state"] == "tracking");
 
     // Weights and eye could be taken, the lit window could not.
-    let hold = "hold_ms = 400.0\n[model]\nnetwork = \"fast\"";
+    let hold = "hold_ms = 400.0\n[model]\nnetwork = \"fast\"\npupil_step_mm = 0";
     let good = write(
         &rig,
         &[("\"left\"", "\"both\""), ("fallback_mm = 3.0", "fallback_mm = 4.2"), ("hold_ms = 1000.0", hold)],
@@ -269,16 +270,27 @@ fn the_rig_file_is_read_again_and_taken_whole_or_not_at_all() {
     write(&good, &[]);
     bench.daemon.as_ref().unwrap().signal(Signal::HUP);
     bench.until("SIGHUP is obeyed", |status| status["eye"] == "both" && status["weights"] == "fast");
+    std::thread::sleep(Duration::from_secs(1));
 
     let (summary, folder) = bench.stop();
     assert_eq!(summary["ended_by"], "holod ctl stop");
     let orders = fs::read_to_string(folder.path().join("record/orders.jsonl")).unwrap();
     let orders: Vec<Value> = orders.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let requests: Vec<_> = orders.iter().map(|order| &order["request"]).collect();
-    let changed =
-        json!({"tracker.eye": "both", "tracker.fallback_mm": 4.2, "tracker.hold_ms": 400.0, "model.network": "fast"});
+    let changed = json!({
+        "tracker.eye": "both", "tracker.fallback_mm": 4.2, "tracker.hold_ms": 400.0, "model.network": "fast",
+        "model.pupil_step_mm": 0.0,
+    });
     assert_eq!(requests[..2], [&json!({"do": "reload"}), &json!({"do": "eye", "eye": "right"})]);
     assert_eq!(requests[2..], [&json!({"do": "reload", "changed": changed}), &json!({"do": "stop"})]);
+
+    let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap();
+    let is_held = |row: &&FieldRow| row.pupil_estimate_mm.is_some_and(|estimate_mm| estimate_mm != row.pupil_mm);
+    // The order's time is taken before the change is handed over.
+    let t_reload_ns = orders[2]["t_ns"].as_i64().unwrap() + 500_000_000;
+    let (before, after): (Vec<_>, Vec<_>) = rows.iter().partition(|row| row.t_wake_ns < t_reload_ns);
+    assert!(before.into_iter().filter(is_held).count() > 0, "a step is in force at first");
+    assert!(!after.is_empty() && after.into_iter().filter(is_held).count() == 0, "and none later");
 }
 
 #[test]

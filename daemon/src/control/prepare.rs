@@ -24,10 +24,17 @@ use crate::source::scene;
 /// Lasers go dark where frames come so much slower.
 const FRAMES_BEFORE_STALL: i64 = 3;
 
-/// What of a rig can change while holod runs, by the keys of the rig file: all that the tracker's thread and the engine
-/// take without anything being opened anew.
-pub(crate) const CHANGEABLE: [&str; 6] =
-    ["name", "tracker.eye", "tracker.scale_mm_per_unit", "tracker.fallback_mm", "tracker.hold_ms", "model.network"];
+/// What of a rig can change while holod runs, by the keys of the rig file: all that the tracker's thread, the frame loop
+/// and the engine take without anything being opened anew.
+pub(crate) const CHANGEABLE: [&str; 7] = [
+    "name",
+    "tracker.eye",
+    "tracker.scale_mm_per_unit",
+    "tracker.fallback_mm",
+    "tracker.hold_ms",
+    "model.network",
+    "model.pupil_step_mm",
+];
 
 /// Reads the rig again, as at the start.
 pub type RigReader = Arc<dyn Fn() -> Result<Rig, Failure> + Send + Sync>;

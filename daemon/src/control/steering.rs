@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
-use holod_calibration::PupilDiameter;
+use holod_calibration::{Metres, PupilDiameter};
 
 /// The frame loop's switches.
 #[derive(Debug, Default)]
@@ -10,13 +10,16 @@ pub(crate) struct Steering {
     paused: AtomicBool,
     /// Bits of millimetres; 0 where the tracker is followed.
     fixed_pupil: AtomicU32,
+    /// Bits of millimetres.
+    pupil_step: AtomicU32,
 }
 
 impl Steering {
-    /// With a pupil that does not follow the tracker, where one is given.
-    pub(crate) fn new(pupil: Option<PupilDiameter>) -> Self {
+    /// With a pupil that does not follow the tracker, where one is given, and the step in which it is followed.
+    pub(crate) fn new(pupil: Option<PupilDiameter>, step: Metres) -> Self {
         let steering = Self::default();
         steering.fix_pupil(pupil);
+        steering.follow_in_steps_of(step);
         steering
     }
 
@@ -41,5 +44,15 @@ impl Steering {
     /// Computes for `pupil`, or follows the tracker.
     pub(crate) fn fix_pupil(&self, pupil: Option<PupilDiameter>) {
         self.fixed_pupil.store(pupil.map_or(0, |pupil| pupil.mm().to_bits()), Ordering::Relaxed);
+    }
+
+    /// How far the estimate goes from the pupil of the last hologram before another one is made, in millimetres.
+    pub(crate) fn pupil_step_mm(&self) -> f32 {
+        f32::from_bits(self.pupil_step.load(Ordering::Relaxed))
+    }
+
+    /// Follows the tracker in other steps.
+    pub(crate) fn follow_in_steps_of(&self, step: Metres) {
+        self.pupil_step.store(((step.0 * 1e3) as f32).to_bits(), Ordering::Relaxed);
     }
 }

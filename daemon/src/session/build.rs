@@ -175,7 +175,7 @@ pub(super) fn build(
     let (places, change_consumer) = rtrb::RingBuffer::new(CHANGES);
     // Beside these, one that the loop has in hand, and one that is sent since the retired ones were last taken.
     let (retired_producer, retired) = rtrb::RingBuffer::new(CHANGES + 2);
-    let steering = Arc::new(Steering::new(plan.pupil));
+    let steering = Arc::new(Steering::new(plan.pupil, rig.pupil_step()));
     let weights = Arc::new(Mutex::new(rig.model.weights.clone()));
     let preparer = Preparer {
         rig: rig.clone(),
@@ -196,7 +196,7 @@ pub(super) fn build(
         Some(playback) => Inputs::Recorded(playback),
         None => Inputs::Followed(Followed {
             pupil: estimates,
-            held: HeldPupil::new((rig.pupil_step().0 * 1e3) as f32),
+            held: HeldPupil::default(),
             pictures,
             steering: Arc::clone(&steering),
         }),

@@ -7,22 +7,17 @@
 use holod_calibration::PupilDiameter;
 
 /// Follows an estimate in steps.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct HeldPupil {
-    step_mm: f32,
     held: Option<PupilDiameter>,
 }
 
 impl HeldPupil {
-    /// Holds a pupil until the estimate is farther than `step_mm` from it.
-    pub(super) const fn new(step_mm: f32) -> Self {
-        Self { step_mm, held: None }
-    }
-
-    /// The pupil for a frame whose estimate is this: the held one, or the estimate itself.
-    pub(super) fn follow(&mut self, estimate: PupilDiameter) -> PupilDiameter {
+    /// The pupil for a frame whose estimate is this: the held one, or the estimate itself where that is farther from it
+    /// than `step_mm`.
+    pub(super) fn follow(&mut self, estimate: PupilDiameter, step_mm: f32) -> PupilDiameter {
         match self.held {
-            Some(held) if (estimate.mm() - held.mm()).abs() <= self.step_mm => held,
+            Some(held) if (estimate.mm() - held.mm()).abs() <= step_mm => held,
             _ => self.take(estimate),
         }
     }
@@ -41,8 +36,8 @@ mod tests {
     const STEP_MM: f32 = 0.1;
 
     fn follow(estimates_mm: &[f32], step_mm: f32) -> Vec<f32> {
-        let mut held = HeldPupil::new(step_mm);
-        estimates_mm.iter().map(|&mm| held.follow(PupilDiameter::from_mm(mm)).mm()).collect()
+        let mut held = HeldPupil::default();
+        estimates_mm.iter().map(|&mm| held.follow(PupilDiameter::from_mm(mm), step_mm).mm()).collect()
     }
 
     fn changes(shown_mm: &[f32]) -> usize {
@@ -74,10 +69,10 @@ mod tests {
 
     #[test]
     fn a_pupil_that_is_taken_is_exact_and_held() {
-        let mut held = HeldPupil::new(STEP_MM);
+        let mut held = HeldPupil::default();
         let mm = |pupil_mm| PupilDiameter::from_mm(pupil_mm);
-        held.follow(mm(3.0));
+        held.follow(mm(3.0), STEP_MM);
         assert_eq!(held.take(mm(3.05)).mm(), 3.05);
-        assert_eq!(held.follow(mm(3.1)).mm(), 3.05);
+        assert_eq!(held.follow(mm(3.1), STEP_MM).mm(), 3.05);
     }
 }

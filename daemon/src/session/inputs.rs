@@ -88,7 +88,7 @@ impl Inputs {
                 // No noise is in the fallback, and what it ends at is the rig's.
                 let pupil = match state {
                     PupilState::Fallback => followed.held.take(estimate.pupil),
-                    _ => followed.held.follow(estimate.pupil),
+                    _ => followed.held.follow(estimate.pupil, followed.steering.pupil_step_mm()),
                 };
                 FramePupil {
                     pupil,

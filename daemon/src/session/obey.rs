@@ -152,6 +152,7 @@ impl Watch<'_> {
         if let Some(engine) = engine {
             self.change_engine(engine)?;
         }
+        self.desk.changes.steering.follow_in_steps_of(rig.pupil_step());
         self.rig = rig;
         let said: Vec<_> = changed
             .iter()
@@ -234,6 +235,7 @@ fn changed_keys(new: &NewRig, old: &Rig) -> BTreeMap<&'static str, Value> {
         "tracker.fallback_mm" => (f64::from(new.tracker.fallback.mm() * 1e4).round() / 1e4).into(),
         "tracker.hold_ms" => (new.tracker.hold.0 as f64 / 1e6).into(),
         "model.network" => setup::weights_name(&new.model.weights).into(),
+        "model.pupil_step_mm" => new.model.pupil_step.map(|step| (step.0 * 1e7).round() / 1e4).into(),
         // The preparer refuses all others.
         _ => Value::Null,
     };
@@ -252,6 +254,7 @@ const fn eye_in_words(eye: Eye) -> &'static str {
 
 #[cfg(test)]
 mod tests {
+    use holod_calibration::Metres;
     use holod_calibration::rig::WeightsChoice;
 
     use super::*;
@@ -269,10 +272,12 @@ mod tests {
             hold: TimeNs(400_000_000),
         };
         rig.model.weights = WeightsChoice::File("/a/mine.safetensors".into());
+        rig.model.pupil_step = Some(Metres(0.000_15));
         let changed = serde_json::to_value(changed_keys(&NewRig { rig, engine: None }, &old)).unwrap();
         let expected = serde_json::json!({
             "name": "other", "tracker.eye": "left", "tracker.scale_mm_per_unit": 0.0125, "tracker.fallback_mm": 3.3,
             "tracker.hold_ms": 400.0, "model.network": "mine.safetensors",
+            "model.pupil_step_mm": 0.15,
         });
         assert_eq!(changed, expected);
         let mut keys: Vec<_> = expected.as_object().unwrap().keys().collect();
