@@ -4,14 +4,17 @@ use crate::session::Summary;
 use crate::source::feed::FeedStatus;
 use crate::spread::Spread;
 
-/// Median and tail in words.
+/// Median and tail in words, and of how many frames: where little is computed they may be those of a run's start.
 pub(crate) fn spread_text(spread: Option<Spread>) -> String {
     let Some(Spread { median_ms, p99_ms, max_ms, values }) = spread else { return "not measured".to_owned() };
-    let newest = match values > Spread::NEWEST as u64 {
-        true => format!(" of the newest {}, longest ever {max_ms:.1} ms", Spread::NEWEST),
-        false => String::new(),
+    let frames = match values {
+        1 => "one frame".to_owned(),
+        _ if values > Spread::NEWEST as u64 => {
+            format!("the newest {} frames, longest ever {max_ms:.1} ms", Spread::NEWEST)
+        }
+        _ => format!("{values} frames"),
     };
-    format!("median {median_ms:.1} ms, p99 {p99_ms:.1} ms{newest}")
+    format!("median {median_ms:.1} ms, p99 {p99_ms:.1} ms of {frames}")
 }
 
 /// What became of a feed's pictures.
@@ -96,10 +99,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_told_of_the_newest_values_alone_says_so() {
+    fn figures_say_of_how_many_frames_they_are() {
         let text = |values| spread_text(Some(Spread { median_ms: 0.5, p99_ms: 3.25, max_ms: 75.5, values }));
-        assert_eq!(text(16_384), "median 0.5 ms, p99 3.2 ms");
-        assert_eq!(text(16_385), "median 0.5 ms, p99 3.2 ms of the newest 16384, longest ever 75.5 ms");
+        assert_eq!(text(1), "median 0.5 ms, p99 3.2 ms of one frame");
+        assert_eq!(text(16_384), "median 0.5 ms, p99 3.2 ms of 16384 frames");
+        assert_eq!(text(16_385), "median 0.5 ms, p99 3.2 ms of the newest 16384 frames, longest ever 75.5 ms");
         assert_eq!(spread_text(None), "not measured");
     }
 }

@@ -56,6 +56,10 @@ fn what_the_buffers_have_already_is_not_computed_again() {
         levels.sort();
         levels.dedup();
         assert!(!levels.contains(&String::new()));
+        let mut computed: Vec<_> = rows.iter().filter(|row| row.computed).map(|row| row.frame).collect();
+        computed.dedup();
+        let shown_of = (1..=summary["frames_computed"].as_u64().unwrap()).contains(&(computed.len() as u64));
+        assert!(shown_of, "{computed:?}: {summary:#}");
         assert_eq!((&summary["frames_made"], &summary["lasers"]["unsafe_findings"]), (&60.into(), &0.into()));
         (summary, levels)
     };

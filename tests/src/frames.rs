@@ -31,6 +31,7 @@ pub struct FieldRow {
     pub picture_fov_x_deg: Option<f64>,
     pub picture_fov_y_deg: Option<f64>,
     pub levels_xxh3: String,
+    pub computed: bool,
 }
 
 /// Reads every row of a record.
@@ -85,6 +86,7 @@ fn row(cells: &HashMap<&str, &str>) -> Result<FieldRow, String> {
         picture_fov_x_deg: cell(cells, "picture_fov_x_deg")?,
         picture_fov_y_deg: cell(cells, "picture_fov_y_deg")?,
         levels_xxh3: cell(cells, "levels_xxh3")?.unwrap_or_default(),
+        computed: needed::<u8>(cells, "computed")? == 1,
     })
 }
 
@@ -181,6 +183,7 @@ mod tests {
                     picture_fov_x_deg: None,
                     picture_fov_y_deg: None,
                     levels_xxh3: String::new(),
+                    computed: true,
                 }
             })
             .collect()

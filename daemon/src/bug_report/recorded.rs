@@ -157,11 +157,11 @@ mod tests {
     }
 
     const ROW: &str =
-        "7,1,green,5,3.25,3.3000002,tracking,10,11,20,21,30,software,33,36,0,4,,00000000000000ab,2,0,1,,,,\n";
+        "7,1,green,5,3.25,3.3000002,tracking,10,11,20,21,30,software,33,36,0,4,,00000000000000ab,2,0,1,,,,,1\n";
 
     #[test]
     fn frames_are_read_with_all_that_they_were_made_of() {
-        let lost = "8,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,,\n";
+        let lost = "8,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,,,\n";
         let rows = [ROW, &ROW.replace("7,1,green", "7,2,red"), ROW, lost, &ROW[..40]].concat();
         let frames = table(&rows).unwrap();
         assert_eq!(frames.len(), 2, "half a row is none");
@@ -182,7 +182,7 @@ mod tests {
             (ROW.replace("green", "mauve"), "line 2: found the colour `mauve`"),
             (ROW.replace("00000000000000ab", "xyz"), "levels_xxh3: found `xyz`, expected hexadecimal digits; ask"),
             (ROW.replace("3.3000002", "wide"), "pupil_mm: found `wide`, expected a number"),
-            ("7,1,green\n".to_owned(), "found 3 cells, expected the 26 that"),
+            ("7,1,green\n".to_owned(), "found 3 cells, expected the 27 that"),
         ] {
             let said = table(&rows).unwrap_err();
             assert!(said.contains(says), "{said}");

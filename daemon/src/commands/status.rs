@@ -71,7 +71,7 @@ fn text_of(status: &Snapshot) -> String {
          panel    {}: {:.2} refreshes a second{}\n\
          lasers   {}{}{}\n\
          engine   {}; weights {}\n\
-         frames   {} a second of the panel's {:.1}{}; {} made, {} shown, {} late\n\
+         frames   {} a second of the panel's {:.1}{}; {} made, {} of them computed, {} shown, {} late\n\
          time     per frame {}; tracker sample to photons {}{feed}{record}",
         status.state,
         status.uptime_s,
@@ -109,6 +109,7 @@ fn text_of(status: &Snapshot) -> String {
         figures.panel_frames_hz,
         figures.speed_advice.as_ref().map_or(String::new(), |advice| format!(" ({advice})")),
         figures.frames_made,
+        figures.frames_computed,
         figures.frames_shown,
         figures.deadline_misses,
         run_text::spread_text(figures.frame_time),

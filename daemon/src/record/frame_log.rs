@@ -23,7 +23,7 @@ enum Cell {
     Frame(fn(&FrameRecord) -> Option<String>),
 }
 
-const COLUMNS: [(&str, Cell); 26] = [
+const COLUMNS: [(&str, Cell); 27] = [
     ("frame", Field(|field| field.frame.to_string())),
     ("field", Field(|field| field.field.to_string())),
     ("colour", Field(|field| field.colour.to_string())),
@@ -51,6 +51,7 @@ const COLUMNS: [(&str, Cell); 26] = [
     ("picture_fov_x_deg", Frame(|frame| frame.picture.view.field_of_view_deg.map(|[across, _]| across.to_string()))),
     ("picture_fov_y_deg", Frame(|frame| frame.picture.view.field_of_view_deg.map(|[_, up]| up.to_string()))),
     ("pupil_estimate_mm", Frame(|frame| frame.pupil_estimate.map(|pupil| pupil.mm().to_string()))),
+    ("computed", Frame(|frame| Some(u8::from(frame.is_computed).to_string()))),
 ];
 
 fn nanoseconds(t: TimeNs) -> String {
@@ -257,14 +258,17 @@ mod tests {
         log.frame(frame(7));
         log.field(&field(7)).unwrap();
         log.field(&field(999)).unwrap();
+        log.frame(FrameRecord { is_computed: false, ..frame(8) });
+        log.field(&field(8)).unwrap();
         log.flush().unwrap();
         let text = fs::read_to_string(folder.path().join("frames.csv")).unwrap();
         let rows: Vec<&str> = text.lines().collect();
         assert_eq!(
             rows[1],
-            "7,1,green,5,3.2500,3.3,tracking,10,11,20,21,30,software,33,36,0,4,3,00000000000000ab,2,0,1,1.25,60,45.5,3.25"
+            "7,1,green,5,3.2500,3.3,tracking,10,11,20,21,30,software,33,36,0,4,3,00000000000000ab,2,0,1,1.25,60,45.5,3.25,1"
         );
-        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,,");
+        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,,,");
+        assert!(rows[3].starts_with("8,1,green,5,") && rows[3].ends_with(",3.25,0"), "{}", rows[3]);
         assert!(rows.iter().all(|row| row.split(',').count() == COLUMNS.len()));
     }
 
@@ -297,7 +301,7 @@ mod tests {
         let rows: Vec<&str> = text.lines().collect();
         let (last, whole) = rows.split_last().unwrap();
         assert!((100..row).contains(&(whole.len() as u64)), "{} of {row}", whole.len());
-        let expected = |number: usize| format!("{number},1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,,");
+        let expected = |number: usize| format!("{number},1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,,,");
         assert!(whole.iter().enumerate().all(|(number, row)| **row == expected(number)), "{text}");
         assert!(expected(whole.len()).starts_with(last), "{last}");
     }
