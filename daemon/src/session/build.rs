@@ -263,7 +263,7 @@ pub(super) fn build(
         names,
         plays,
         rings,
-        panel: OutputWatch::new(output.panel_events, &rig, output.takes_software_times),
+        panel: OutputWatch::new(output.panel_events, rig, output.takes_software_times),
         laser_box: LaserBoxWatch::new(output.laser_faults, output.laser_watch),
         tracker_watch: TrackerWatch::new(&rig.tracker, tracker.figures(), t_origin),
         tracker,
