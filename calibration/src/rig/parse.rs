@@ -837,8 +837,8 @@ fn read_head_limits<'a>(
                         power_limit_mw is for the panel";
         let limits = needing.iter().map(|colour| format!("{colour} = ...")).collect::<Vec<_>>().join(", ");
         let advice = format!(
-            "write head_limit_mw = {{ {limits} }}: what the bench is safe with where nothing is lost on the way, or a \
-             little more than is needed"
+            "write head_limit_mw = {{ {limits} }}, in mW at the laser itself: the greatest power that the bench is safe \
+             with, whatever is in the laser's way"
         );
         reader.fault_in(lasers, KEY, line, &found, expected, advice);
     }
@@ -873,6 +873,8 @@ fn check_mode<'a>(
     driver: Option<&LaserDriver>,
     gated_by_panel: bool,
 ) {
+    const BY_PANEL: &str =
+        "write gated_by_panel = true where the panel's own hardware gates each laser to its field, or ";
     let Some(mode) = timing.map(|timing| timing.mode) else { return };
     let packed = PanelMode::ChannelPacked.name();
     let is_of_one_colour = matches!(mode, PanelMode::Monochrome(_));
@@ -880,13 +882,7 @@ fn check_mode<'a>(
         let line = reader.line_of_key(lasers, "driver");
         let found =
             format!("\"{}\" in {} mode, whose fields these lasers cannot be switched for", driver.name(), mode.name());
-        let by_panel = match mode {
-            PanelMode::ChannelPacked => {
-                "write gated_by_panel = true where the panel's own hardware gates each laser to its \
-                                         field, or "
-            }
-            _ => "",
-        };
+        let by_panel = if mode == PanelMode::ChannelPacked { BY_PANEL } else { "" };
         let advice = format!(
             "{by_panel}show one colour (mode = \"monochrome\"), or light fields with a laser box (driver = \"serial\")"
         );
