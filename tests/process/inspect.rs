@@ -437,6 +437,19 @@ fn check_refuses_what_a_laser_box_would_refuse_at_the_start_of_a_run_in_the_same
     }
     let (passed, says) = lasers(("red = 1.0", "red = 1.0"));
     assert!(passed && says.contains("dark, interlock closed"), "{says}");
+    // Whatever else is wrong with the rig, its lasers are put out.
+    let dark = |rig: String| {
+        fs::write(folder.path().join("rig.toml"), rig).unwrap();
+        run(HOLOD, &["dark", "--config", "rig.toml"], folder.path())
+    };
+    for (from, to) in
+        [("bit_depth = 8", "bit_depth = 8\nlut = \"gone.csv\""), ("power_mw", "power_mW"), ("[optics]", "[optic]")]
+    {
+        let ended = dark(rig.replacen(from, to, 1));
+        assert!(ended.status.success() && ended.stdout.contains("acknowledged that they are dark"), "{to}: {ended:?}");
+        assert!(ended.stderr.contains("its lasers are put out nevertheless"), "{to}: {ended:?}");
+    }
+    assert_eq!(dark(rig.replacen("device", "devise", 1)).status.code(), Some(78));
 }
 
 #[test]

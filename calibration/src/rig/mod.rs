@@ -526,6 +526,12 @@ impl Rig {
         parse::parse(&text, path, read_spec)
     }
 
+    /// The lasers of the rig file at `path`, even where something else is wrong in it or in a file that it names: that
+    /// keeps no laser from being put out. None where the file does not say them right, as [`Rig::load`] then tells.
+    pub fn laser_driver(path: &Path) -> Option<LaserDriver> {
+        parse::laser_driver(&files::read_text(path).ok()?, path)
+    }
+
     /// Validates a rig file's text. Relative paths in it start at the folder of `origin`, and the files there are
     /// read.
     ///

@@ -159,6 +159,18 @@ pub(super) fn parse(text: &str, origin: &Path, read_spec: SpecReader<'_>) -> Res
     rig.map_err(|faults| RigError { origin: origin.display().to_string(), faults })
 }
 
+/// The lasers of a rig file's text, whatever else is wrong with it; none where it does not say them right.
+pub(super) fn laser_driver(text: &str, origin: &Path) -> Option<LaserDriver> {
+    let mut driver = None;
+    let folder = origin.parent().unwrap_or(Path::new(""));
+    let _faults = Reader::read(text, |reader, root| {
+        let lasers = reader.section(root, "lasers", true);
+        driver = read_driver(reader, lasers, folder, &mut Provenance::default());
+        Some(())
+    });
+    driver
+}
+
 fn read_rig<'a>(
     reader: &Reader<'a>,
     root: Section<'a>,

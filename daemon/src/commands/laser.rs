@@ -50,8 +50,7 @@ fn put_out(args: &LaserArgs) -> Result<(), Failure> {
                      PATH, the port of a laser box; nothing was put out";
         return Err(Failure::new(Exit::Usage, which));
     }
-    let rig = bench(args)?;
-    let driver = &rig.lasers.driver;
+    let driver = &lasers(args)?;
     if *driver == LaserDriver::Simulated {
         return results::print("no laser box on this bench: its simulated lasers ended with the daemon");
     }
@@ -67,6 +66,18 @@ fn put_out(args: &LaserArgs) -> Result<(), Failure> {
         }
     };
     results::print(&format!("{}: the lasers acknowledged that they are dark{who_knows}", ports(driver)))
+}
+
+/// The lasers of the rig that was named, whatever else is wrong with it, or the laser box at the port that was named.
+fn lasers(args: &LaserArgs) -> Result<LaserDriver, Failure> {
+    if let Some(path) = &args.port {
+        return Ok(LaserDriver::Serial { path: path.clone(), sync_wire: false });
+    }
+    setup::rig_of_lasers(&args.rig).map(|rig| rig.lasers.driver).or_else(|failure| {
+        let Some(driver) = args.rig.config.as_deref().and_then(Rig::laser_driver) else { return Err(failure) };
+        tracing::warn!("{failure}; its lasers are put out nevertheless");
+        Ok(driver)
+    })
 }
 
 /// The rig that was named, or the built-in one with a laser box at the port that was named.

@@ -221,7 +221,7 @@ pub fn clipping_fault(clipped_share: f32) -> Option<String> {
     })
 }
 
-/// Refuses the hologram of the last frame where it is no numbers, as [`check_numbers`] does.
+/// Refuses the hologram of the last frame where it is no numbers: double phase would make darkness of it.
 ///
 /// # Errors
 /// A value is not finite, or the device that has it failed.
@@ -229,7 +229,7 @@ pub fn check_last_hologram(renderer: &mut dyn Renderer) -> Result<(), Failure> {
     check_numbers(renderer.hologram().map_err(Failure::because(Exit::Unavailable))?)
 }
 
-/// Refuses a hologram that is no numbers: double phase would make darkness of it.
+/// The same of a hologram at hand.
 ///
 /// # Errors
 /// A value is not finite.
