@@ -59,7 +59,7 @@ impl PupilPlot<'_> {
         let greatest = self.samples.iter().map(|mark| mark.raw_mm).fold(f64::MIN_POSITIVE, f64::max);
         let top = if self.unit.is_none() { GREATEST_MM } else { 1.1 * greatest };
         let caption = match (self.unit, self.of_log) {
-            (None, false) => "Pupil diameter: what the tracker said, what the gate kept, what the display used",
+            (None, false) => "Pupil diameter: what the tracker said, what the gate kept, what the filter expected",
             (None, true) => "Pupil diameter: what the tracker said, what the gate kept, what the filter makes of it",
             (Some(_), _) => "Pupil size: what the tracker said, in its own unit",
         };
@@ -169,7 +169,7 @@ mod tests {
         let svg = std::fs::read_to_string(&path).unwrap();
         assert!(svg.contains("#D63C28") && svg.contains("#96AAC8"));
         assert!(!svg.contains("simulated eye itself"));
-        let [of_run, of_log] = ["what the display used", "what the filter makes of it"];
+        let [of_run, of_log] = ["what the filter expected", "what the filter makes of it"];
         assert!(svg.contains(of_run) && svg.contains("photons") && !svg.contains(of_log));
         PupilPlot { of_log: true, ..plot }.save(&path).unwrap();
         let svg = std::fs::read_to_string(&path).unwrap();
