@@ -70,34 +70,8 @@ fn like(engine: &str, there_are: impl Fn(Adapters) -> bool) -> Backend {
 /// # Errors
 /// The report lacks what every frame needs, or none of its frames can be made again.
 pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
-    let data = |what: String| Failure::new(Exit::Data, what);
-    let facts = report.text(RUN)?.ok_or_else(|| {
-        data(
-            "the report holds no run: its frames cannot be shown again; `holod report DIR` packs a record of one"
-                .into(),
-        )
-    })?;
-    let facts: RunFacts = serde_json::from_str(&facts).map_err(|error| {
-        data(format!("{RUN}: {error}; show it with the holod that made it, or ask for the report again"))
-    })?;
-    let config = report.path(BENCH).join(RIG);
-    refuse_foreign_files(report)?;
-    let mut rig = Rig::load(&config).map_err(Failure::because(Exit::Data))?;
-    // Nothing that a report says lights a laser.
-    rig.lasers.driver = LaserDriver::Simulated;
-    // Nor does it name this machine's GPU.
-    rig.model.gpu = None;
-    if let Some(scale) = facts.scale_mm_per_unit {
-        rig.tracker.scale = Some(scale);
-    }
-    let [width, height] = facts.hologram;
-    let resolution = Resolution { width, height };
-    let panel = rig.resolution();
-    if width.min(height) == 0 || width > panel.width || height > panel.height {
-        return Err(data(format!(
-            "{RUN}: found a hologram of {resolution}, expected one that fits on the panel of {panel}"
-        )));
-    }
+    let facts = facts(report)?;
+    let (rig, resolution) = bench(report, &facts)?;
     let backend = match backend {
         Backend::Auto => like(&facts.engine, |adapters| gpu::find(adapters).is_ok()),
         asked => asked,
@@ -143,7 +117,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     if cues.is_empty() {
         let why: Vec<_> = not_again.iter().map(|(why, count)| format!("{count} frames: {why}")).collect();
         let why = if why.is_empty() { "the panel showed none".into() } else { why.join("; ") };
-        return Err(data(format!("no frame of the report can be shown again: {why}")));
+        return Err(unfit(format!("no frame of the report can be shown again: {why}")));
     }
     let Material { engines, patterns, pictures, scenes, .. } = material;
     let first = match scenes.into_iter().find(|(order, _)| *order == 0) {
@@ -154,6 +128,45 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     let comparison = Comparison::new(frames, &cues, not_again, &facts);
     let playback = Playback { cues, pictures, engines, patterns, at: 0, engine: 0 };
     Ok(Played { rig, pictures: Pictures::Scene(first), backend, playback, comparison })
+}
+
+fn unfit(what: String) -> Failure {
+    Failure::new(Exit::Data, what)
+}
+
+/// What the report says of its run.
+fn facts(report: &Unpacked) -> Result<RunFacts, Failure> {
+    let facts = report.text(RUN)?.ok_or_else(|| {
+        unfit(
+            "the report holds no run: its frames cannot be shown again; `holod report DIR` packs a record of one"
+                .into(),
+        )
+    })?;
+    serde_json::from_str(&facts).map_err(|error| {
+        unfit(format!("{RUN}: {error}; show it with the holod that made it, or ask for the report again"))
+    })
+}
+
+/// The rig of the report, with simulated lasers, and the size of its holograms.
+fn bench(report: &Unpacked, facts: &RunFacts) -> Result<(Rig, Resolution), Failure> {
+    refuse_foreign_files(report)?;
+    let mut rig = Rig::load(&report.path(BENCH).join(RIG)).map_err(Failure::because(Exit::Data))?;
+    // Nothing that a report says lights a laser.
+    rig.lasers.driver = LaserDriver::Simulated;
+    // Nor does it name this machine's GPU.
+    rig.model.gpu = None;
+    if let Some(scale) = facts.scale_mm_per_unit {
+        rig.tracker.scale = Some(scale);
+    }
+    let [width, height] = facts.hologram;
+    let resolution = Resolution { width, height };
+    let panel = rig.resolution();
+    if width.min(height) == 0 || width > panel.width || height > panel.height {
+        return Err(unfit(format!(
+            "{RUN}: found a hologram of {resolution}, expected one that fits on the panel of {panel}"
+        )));
+    }
+    Ok((rig, resolution))
 }
 
 /// Refuses a rig that names files outside of the report, before any of them is opened.

@@ -6,7 +6,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::cli::EvaluateArgs;
 use crate::evaluation::{
-    Estimate, Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, RefocusRow,
+    Estimate, Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, RefocusRow, Row,
     SceneViews,
 };
 use crate::failure::Failure;
@@ -104,12 +104,22 @@ fn sheet(evaluated: &Evaluated) -> Sheet {
 }
 
 fn table(evaluation: &Evaluation) -> String {
+    let mut text = head(evaluation);
+    evaluation.rows.iter().for_each(|row| text.push_str(&pupil_row(row)));
+    text.push_str(&matrix(&evaluation.matrix));
+    text.push_str(&refocus(&evaluation.refocus));
+    text.push_str(&marks(&evaluation.marks));
+    text
+}
+
+/// What was judged, and the columns' names and units.
+fn head(evaluation: &Evaluation) -> String {
     let Evaluation { scenes, border_px, panel_bit_depth, made_with, engine, .. } = evaluation;
     let MadeWith { weights, rig, .. } = made_with;
     let colours: Vec<&str> = evaluation.colours.iter().map(|colour| colour.name()).collect();
     let size = Resolution { width: evaluation.width_px, height: evaluation.height_px };
     let focus = &evaluation.focus_dpt;
-    let mut text = format!(
+    format!(
         "weights {weights} on {scenes} scenes of {size}, {} planes from {:.2} to {:.2} dpt, {panel_bit_depth}-bit levels; \
          a border of {border_px} px is left out\n\
          rig {rig}, judged in {}; computed by {engine}\n\
@@ -141,55 +151,70 @@ fn table(evaluation: &Evaluation) -> String {
         "0.001",
         "dB",
         "%",
-    );
-    for row in &evaluation.rows {
-        let scaled = |estimate: Option<Estimate>, scale: f64, decimals: usize| {
-            estimate.map_or("none".to_owned(), |Estimate { mean, ci95_half_width, .. }| {
-                let mean = scale * mean;
-                match ci95_half_width {
-                    Some(half_width) => format!("{mean:.decimals$} ± {:.decimals$}", scale * half_width),
-                    None => format!("{mean:.decimals$}"),
-                }
-            })
-        };
-        let figure = |estimate, decimals| scaled(estimate, 1.0, decimals);
-        let clipped = row.clipped_share.map_or("none".to_owned(), |share| format!("{:.3}", 100.0 * share.mean));
-        text.push_str(&format!(
-            "{:>8} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {clipped:>11}\n",
-            row.pupil_mm,
-            figure(row.psnr_db, 2),
-            figure(row.psnr_in_focus_db, 2),
-            figure(row.psnr_out_of_focus_db, 2),
-            figure(row.slope, 3),
-            figure(row.correlation, 3),
-            figure(row.ssim, 3),
-            scaled(row.foam, 1e3, 2),
-            figure(row.flat_oracle_psnr_db, 2),
-        ));
-    }
-    text.push_str("\nPSNR / dB of what is made for one pupil (rows) and seen by another (columns)\n        ");
-    let Matrix { given_pupil_mm, judged_pupil_mm, psnr_db } = &evaluation.matrix;
+    )
+}
+
+fn pupil_row(row: &Row) -> String {
+    let scaled = |estimate: Option<Estimate>, scale: f64, decimals: usize| {
+        estimate.map_or("none".to_owned(), |Estimate { mean, ci95_half_width, .. }| {
+            let mean = scale * mean;
+            match ci95_half_width {
+                Some(half_width) => format!("{mean:.decimals$} ± {:.decimals$}", scale * half_width),
+                None => format!("{mean:.decimals$}"),
+            }
+        })
+    };
+    let figure = |estimate, decimals| scaled(estimate, 1.0, decimals);
+    let clipped = row.clipped_share.map_or("none".to_owned(), |share| format!("{:.3}", 100.0 * share.mean));
+    format!(
+        "{:>8} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {clipped:>11}\n",
+        row.pupil_mm,
+        figure(row.psnr_db, 2),
+        figure(row.psnr_in_focus_db, 2),
+        figure(row.psnr_out_of_focus_db, 2),
+        figure(row.slope, 3),
+        figure(row.correlation, 3),
+        figure(row.ssim, 3),
+        scaled(row.foam, 1e3, 2),
+        figure(row.flat_oracle_psnr_db, 2),
+    )
+}
+
+fn matrix(Matrix { given_pupil_mm, judged_pupil_mm, psnr_db }: &Matrix) -> String {
+    let mut text =
+        "\nPSNR / dB of what is made for one pupil (rows) and seen by another (columns)\n        ".to_owned();
     text.extend(judged_pupil_mm.iter().map(|pupil_mm| format!("{:>10}", format!("{pupil_mm} mm"))));
     for (given_mm, line) in given_pupil_mm.iter().zip(psnr_db) {
         text.push_str(&format!("\n{:>8}", format!("{given_mm} mm")));
         text.extend(line.iter().map(|psnr_db| format!("{psnr_db:>10.2}")));
     }
-    if !evaluation.refocus.is_empty() {
-        text.push_str("\n\nrefocus ratio: a card's gradient energy in focus over out of focus\n");
-        text.push_str(&format!("{:>8}{:>18}{:>12}{:>12}", "pupil mm", "marks", "near card", "far card"));
-        for RefocusRow { contrast, pupil_mm, near_card, far_card, .. } in &evaluation.refocus {
-            text.push_str(&format!("\n{pupil_mm:>8}{contrast:>18}{near_card:>12.2}{far_card:>12.2}"));
-        }
+    text
+}
+
+/// Nothing where no cards were judged.
+fn refocus(rows: &[RefocusRow]) -> String {
+    if rows.is_empty() {
+        return String::new();
     }
-    if !evaluation.marks.is_empty() {
-        text.push_str(
-            "\n\nbright marks on exact black: all light seen over what was put in, and mean light of what is ",
-        );
-        text.push_str("black, in thousandths of white\n");
-        text.push_str(&format!("{:>8}{:>18}{:>12}{:>12}", "pupil mm", "marks", "light", "black"));
-        for MarksRow { marks, pupil_mm, light_ratio, dark_mean, .. } in &evaluation.marks {
-            text.push_str(&format!("\n{pupil_mm:>8}{marks:>18}{light_ratio:>12.3}{:>12.4}", 1e3 * dark_mean));
-        }
+    let mut text = "\n\nrefocus ratio: a card's gradient energy in focus over out of focus\n".to_owned();
+    text.push_str(&format!("{:>8}{:>18}{:>12}{:>12}", "pupil mm", "marks", "near card", "far card"));
+    for RefocusRow { contrast, pupil_mm, near_card, far_card, .. } in rows {
+        text.push_str(&format!("\n{pupil_mm:>8}{contrast:>18}{near_card:>12.2}{far_card:>12.2}"));
+    }
+    text
+}
+
+/// Nothing where no marks were judged.
+fn marks(rows: &[MarksRow]) -> String {
+    if rows.is_empty() {
+        return String::new();
+    }
+    let mut text = "\n\nbright marks on exact black: all light seen over what was put in, and mean light of what is \
+                    black, in thousandths of white\n"
+        .to_owned();
+    text.push_str(&format!("{:>8}{:>18}{:>12}{:>12}", "pupil mm", "marks", "light", "black"));
+    for MarksRow { marks, pupil_mm, light_ratio, dark_mean, .. } in rows {
+        text.push_str(&format!("\n{pupil_mm:>8}{marks:>18}{light_ratio:>12.3}{:>12.4}", 1e3 * dark_mean));
     }
     text
 }

@@ -61,14 +61,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let pictures =
         progress::during("loading the scene", || source::named(&args.scene, args.feed_dark_after, &rig.geometry))?;
     let page = Page::open(&args.page)?;
-    let folder = match (&args.record, &args.record_in) {
-        (Some(path), _) => Some(RecordFolder::claim(path, args.force)?),
-        (None, Some(parent)) => Some(RecordFolder::claim_new(parent, SystemTime::now())?),
-        (None, None) => None,
-    };
-    let recorder = |folder| Recorder::create(folder, args, &rig, pictures.resolution());
-    let recorder = folder.map(recorder).transpose()?;
-    let mut observers = (recorder.map(|recorder| recorder.with_tracker(tracker.to_string())), page);
+    let recorder = recorder(args, &rig, &tracker, pictures.resolution())?;
     let network = weights.config();
     tracing::info!(
         "{} of {}{} by network {} {}",
@@ -90,13 +83,39 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         tracker,
         ports_of_others,
         pupil: args.pupil,
-        record_tracker: observers.0.as_ref().map(|recorder| RecordFiles::in_folder(&recorder.folder())),
-        record: observers.0.as_ref().map(Recorder::health),
+        record_tracker: recorder.as_ref().map(|recorder| RecordFiles::in_folder(&recorder.folder())),
+        record: recorder.as_ref().map(Recorder::health),
         frame_limit: args.frames,
         duration: args.duration,
-        keep_levels: observers.0.is_some(),
-        hash_levels: observers.0.is_some(),
+        keep_levels: recorder.is_some(),
+        hash_levels: recorder.is_some(),
     };
+    run_to_the_end(plan, args, recorder, page)
+}
+
+/// What writes the run's record, where one is asked for.
+fn recorder(
+    args: &RunArgs,
+    rig: &Rig,
+    tracker: &TrackerSpec,
+    hologram: Resolution,
+) -> Result<Option<Recorder>, Failure> {
+    let folder = match (&args.record, &args.record_in) {
+        (Some(path), _) => RecordFolder::claim(path, args.force)?,
+        (None, Some(parent)) => RecordFolder::claim_new(parent, SystemTime::now())?,
+        (None, None) => return Ok(None),
+    };
+    Ok(Some(Recorder::create(folder, args, rig, hologram)?.with_tracker(tracker.to_string())))
+}
+
+/// Runs, finishes the record and says what came of both.
+fn run_to_the_end(
+    plan: SessionPlan,
+    args: &RunArgs,
+    recorder: Option<Recorder>,
+    page: Option<Page>,
+) -> Result<(), Failure> {
+    let mut observers = (recorder, page);
     let session = match session::run(plan, &mut observers) {
         Ok(session) => session,
         Err(failure) => {

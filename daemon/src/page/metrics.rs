@@ -22,6 +22,7 @@ use crate::logging;
 use crate::record::RecordCondition;
 use crate::session::pupil_states;
 use crate::snapshot::Snapshot;
+use crate::source::feed::FeedStatus;
 
 /// What scrapers of OpenMetrics expect.
 pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -101,28 +102,7 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
             ("tracker", &figures.tracker),
         ],
     )?;
-    told.states("state", "How the run is", &["dark", "running", "degraded"], &snapshot.state)?;
-    told.states(
-        "tracker_link",
-        "How the tracker's link is",
-        &["up", "silent", "down", "finished"],
-        &figures.tracker_link,
-    )?;
-    told.states("pupil_state", "What the pupil rests on", &pupil_states(), &snapshot.pupil_state)?;
-    for (name, help, is_so) in [
-        ("lasers_armed", "Whether lasers may be lit", snapshot.lasers == "armed"),
-        ("lasers_kept_dark", "Whether a person keeps the lasers dark", snapshot.lasers_kept_dark),
-        (
-            "feed_keeps_dark",
-            "Whether lasers are dark as the live feed gives no pictures",
-            snapshot.feed_trouble.is_some(),
-        ),
-        ("laser_box_lost", "Whether something is wrong with the laser box", snapshot.lasers_trouble.is_some()),
-        ("panel_lost", "Whether the panel is lost", snapshot.panel_trouble.is_some()),
-        ("paused", "Whether the picture stands still", snapshot.paused),
-    ] {
-        told.gauge(name, help, None, f64::from(u8::from(is_so)))?;
-    }
+    of_states(told, snapshot)?;
     told.gauge("uptime", "How long it has run", Some(Unit::Seconds), snapshot.uptime_s)?;
     if let Some(pupil_mm) = snapshot.pupil_mm {
         let metres = f64::from(pupil_mm) / 1e3;
@@ -147,7 +127,37 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
         told.gauge("record_lost", "Whether the record was given up", None, lost)?;
         told.counter("record_rows_lost", "Rows of the record that a slow disk left out", record.rows_lost)?;
     }
-    let Some(feed) = &figures.feed else { return Ok(()) };
+    figures.feed.as_ref().map_or(Ok(()), |feed| of_feed(told, feed))
+}
+
+/// How the run and its parts are: one of several states, or whether something is so.
+fn of_states(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
+    told.states("state", "How the run is", &["dark", "running", "degraded"], &snapshot.state)?;
+    told.states(
+        "tracker_link",
+        "How the tracker's link is",
+        &["up", "silent", "down", "finished"],
+        &snapshot.figures.tracker_link,
+    )?;
+    told.states("pupil_state", "What the pupil rests on", &pupil_states(), &snapshot.pupil_state)?;
+    for (name, help, is_so) in [
+        ("lasers_armed", "Whether lasers may be lit", snapshot.lasers == "armed"),
+        ("lasers_kept_dark", "Whether a person keeps the lasers dark", snapshot.lasers_kept_dark),
+        (
+            "feed_keeps_dark",
+            "Whether lasers are dark as the live feed gives no pictures",
+            snapshot.feed_trouble.is_some(),
+        ),
+        ("laser_box_lost", "Whether something is wrong with the laser box", snapshot.lasers_trouble.is_some()),
+        ("panel_lost", "Whether the panel is lost", snapshot.panel_trouble.is_some()),
+        ("paused", "Whether the picture stands still", snapshot.paused),
+    ] {
+        told.gauge(name, help, None, f64::from(u8::from(is_so)))?;
+    }
+    Ok(())
+}
+
+fn of_feed(told: &mut Teller<'_>, feed: &FeedStatus) -> fmt::Result {
     told.gauge("feed_clients", "Clients of the live feed", None, feed.clients.len() as f64)?;
     let pictures = [
         ("taken", feed.taken),
@@ -268,7 +278,7 @@ mod tests {
     use super::super::live::Refused;
     use super::*;
     use crate::record::RecordState;
-    use crate::source::feed::{ClippedPixels, FeedStatus};
+    use crate::source::feed::ClippedPixels;
 
     #[test]
     fn counters_do_not_fall_where_a_late_sample_fills_a_gap() {

@@ -11,13 +11,14 @@ use holod_model::engine::EngineError;
 use holod_pupil_input::{ReplaySpeed, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, adapter_delay_warning};
 use holod_slm_output::laser::{DarkReason, open_laser};
 use holod_slm_output::output::{OutputError, pacing_config};
+use holod_slm_output::pacing::PacingConfig;
 use holod_slm_output::present::{PanelSetup, open_panel};
-use holod_slm_output::{LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
+use holod_slm_output::{FramePort, LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
 
 use super::clock::host_now;
 use super::desk::{Changes, Desk};
 use super::feed_watch::FeedWatch;
-use super::frame_loop::{FrameLoop, RECORDS};
+use super::frame_loop::{Change, FrameLoop, LoopRecord, RECORDS};
 use super::held_pupil::HeldPupil;
 use super::inputs::{Followed, Inputs, Playback, TrainedPupils};
 use super::laser_watch::LaserBoxWatch;
@@ -80,11 +81,40 @@ pub(super) fn build(
     let service = Service::connect();
     // Its threads keep the priority of whoever calls it first, which must not be the panel's.
     scheduling::patient(rayon::current_num_threads);
-    let plays = playback.is_some();
-    let is_all = playback.as_ref().is_some_and(|playback| plan.frame_limit == Some(playback.cues.len() as u64));
-    let frames_over = if is_all { "the end of the report" } else { "the asked number of frames" };
-    let resolution = plan.pictures.resolution();
-    let rig = &plan.rig;
+    let network = prepare_network(&plan, &service)?;
+    let pacing = pacing_config(&plan.rig, network.frame_time).map_err(Failure::because(Exit::Config))?;
+
+    let t_origin = host_now();
+    let tracker = open_tracker(&plan, playback.is_some(), t_origin)?;
+    let pictures =
+        source::open(&plan.pictures, &plan.rig.geometry, t_origin).map_err(Failure::because(Exit::Unavailable))?;
+    let options = OutputOptions {
+        keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
+        stall_timeout: plan.rig.lasers.stall_timeout.unwrap_or_else(|| stall_timeout(network.frame_time)),
+        look: observer.wants_look(),
+    };
+    let bench = open_bench_dark(&plan, &network.encoder, options, &mut signals)?;
+
+    let parts = Parts { service, signals, network, pacing, t_origin, tracker, pictures, bench };
+    parts.start(plan, playback, observer)
+}
+
+/// What turns a picture and a pupil into the panel's levels.
+struct Network {
+    encoder: Arc<PanelEncoder>,
+    renderer: Box<dyn Renderer>,
+    /// How long a frame took, before anything was shown.
+    frame_time: TimeNs,
+    /// It has been said what would bring more frames a second.
+    advised: bool,
+    used_for: Use,
+    /// Ends the frame thread, and whatever the renderer waits for.
+    stop: Arc<AtomicBool>,
+}
+
+/// Prepares encoder and engine, makes the first frames, and says how long one takes.
+fn prepare_network(plan: &SessionPlan, service: &Service) -> Result<Network, Failure> {
+    let (rig, resolution) = (&plan.rig, plan.pictures.resolution());
     let encoder = progress::during(&format!("preparing the levels of the panel of {}", rig.resolution()), || {
         renderer::panel_encoder(rig, resolution)
     })?;
@@ -101,23 +131,24 @@ pub(super) fn build(
         Ok::<_, Failure>((renderer, frame_time))
     })?;
     tracing::info!("holograms are computed by {}", renderer.description());
-    let engine = Arc::new(Mutex::new(renderer.description().to_owned()));
-    let advised = tell_frame_time(&plan, frame_time, renderer.description());
-    let pacing = pacing_config(rig, frame_time).map_err(Failure::because(Exit::Config))?;
+    let advised = tell_frame_time(plan, frame_time, renderer.description());
+    Ok(Network { encoder, renderer, frame_time, advised, used_for, stop })
+}
 
-    let t_origin = host_now();
-    let tracker_options = TrackerOptions {
+/// Starts the tracker, or none for frames that are made again; says what is to be known of it.
+fn open_tracker(plan: &SessionPlan, plays: bool, t_origin: TimeNs) -> Result<TrackerHandle, Failure> {
+    let options = TrackerOptions {
         origin: t_origin,
         record: plan.record_tracker.clone(),
         forbidden: plan.ports_of_others.clone(),
         reader_begins: Some(scheduling::raise),
     };
-    let tracker = if plays {
-        TrackerHandle::ended(&rig.tracker)
+    let handle = if plays {
+        TrackerHandle::ended(&plan.rig.tracker)
     } else {
-        Tracker::start(&plan.tracker, &rig.tracker, tracker_options).map_err(setup::tracker_failure)?
+        Tracker::start(&plan.tracker, &plan.rig.tracker, options).map_err(setup::tracker_failure)?
     };
-    let TrackerHandle { estimate: estimates, decisions: tap, control: tracker } = tracker;
+    let tracker = &handle.control;
     for warning in tracker.warnings() {
         tracing::warn!("{warning}");
     }
@@ -125,28 +156,52 @@ pub(super) fn build(
         tracing::info!("{remark}");
     }
     tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
+    Ok(handle)
+}
 
-    let (scene, scene_figures) = (plan.pictures.name().to_owned(), plan.pictures.figures());
-    let dark_after = match &plan.pictures {
-        Pictures::Feed(feed) => feed.dark_after,
-        Pictures::Scene(_) => None,
-    };
-    let OpenPictures { sink, source: pictures, feed } =
-        source::open(&plan.pictures, &rig.geometry, t_origin).map_err(Failure::because(Exit::Unavailable))?;
-    let options = OutputOptions {
-        keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
-        stall_timeout: rig.lasers.stall_timeout.unwrap_or_else(|| stall_timeout(frame_time)),
-        look: observer.wants_look(),
-    };
+/// Panel and lasers, flat and dark.
+struct Bench {
+    output: Output,
+    dark_note: DarkNote,
+    /// Whether a note keeps the lasers dark from the beginning.
+    found: Found,
+    stall_timeout: TimeNs,
+}
+
+/// Opens panel and lasers; from here on every end of the process puts the lasers out. They stay dark where a person
+/// asked for that of an earlier run.
+fn open_bench_dark(
+    plan: &SessionPlan,
+    encoder: &PanelEncoder,
+    options: OutputOptions,
+    signals: &mut Signals,
+) -> Result<Bench, Failure> {
     let output =
-        progress::during("opening panel and lasers", || scheduling::prompt(|| open_output(&plan, &encoder, options)))?;
+        progress::during("opening panel and lasers", || scheduling::prompt(|| open_output(plan, encoder, options)))?;
     output.control.attend();
-    let dark_note = DarkNote::on(&rig.lasers.driver);
+    let driver = &plan.rig.lasers.driver;
+    let dark_note = DarkNote::on(driver);
     let found = dark_note.look();
     if !matches!(found, Found::Nothing) {
         output.control.keep_dark(Some(DarkReason::Asked));
     }
-    match &found {
+    warn_of_dark_note(&found);
+    if let LaserDriver::Serial { path, .. } = driver
+        && let Some(warning) = adapter_delay_warning("laser", path)
+    {
+        tracing::warn!("{warning}");
+    }
+    signals.end_after_lasers(driver);
+    tracing::debug!("panel `{}` is open; lasers by {driver:?}", plan.output);
+    output
+        .control
+        .dark_switch()
+        .install_panic_hook(host_now, || holod_model::gpu::panic_is_caught() || control::panic_is_caught());
+    Ok(Bench { output, dark_note, found, stall_timeout: options.stall_timeout })
+}
+
+fn warn_of_dark_note(found: &Found) {
+    match found {
         Found::Nothing => {}
         Found::Note(note) => tracing::warn!(
             "the lasers stay dark: `holod ctl lasers dark` put them out before this holod was started, as {} says; `holod \
@@ -158,59 +213,149 @@ pub(super) fn build(
              started: {error}; let this user read that folder, or look whether they may be lit: `holod ctl lasers arm`"
         ),
     }
-    if let LaserDriver::Serial { path, .. } = &rig.lasers.driver
-        && let Some(warning) = adapter_delay_warning("laser", path)
-    {
-        tracing::warn!("{warning}");
-    }
-    signals.end_after_lasers(&rig.lasers.driver);
-    tracing::debug!("panel `{}` is open; lasers by {:?}", plan.output, rig.lasers.driver);
-    output
-        .control
-        .dark_switch()
-        .install_panic_hook(host_now, || holod_model::gpu::panic_is_caught() || control::panic_is_caught());
+}
 
+/// Everything that has been opened for a run, before its first frame.
+struct Parts {
+    service: Service,
+    signals: Signals,
+    network: Network,
+    pacing: PacingConfig,
+    t_origin: TimeNs,
+    tracker: TrackerHandle,
+    pictures: OpenPictures,
+    bench: Bench,
+}
+
+impl Parts {
+    /// Starts the frame thread, and hands the rest to the control thread.
+    fn start(
+        self,
+        plan: SessionPlan,
+        playback: Option<Playback>,
+        observer: &mut dyn Observer,
+    ) -> Result<Session<'_>, Failure> {
+        let plays = playback.is_some();
+        let limits = limits_of(&plan, playback.as_ref(), self.t_origin);
+        let preparer = self.preparer(&plan, plays);
+        let Self { service, signals, network, pacing, t_origin, tracker, pictures, bench } = self;
+        let Bench { output, found, .. } = bench;
+        let Network { encoder, renderer, advised, stop, .. } = network;
+        let engine = Arc::new(Mutex::new(renderer.description().to_owned()));
+        let weights = Arc::clone(&preparer.weights);
+        let steering = Arc::new(Steering::new(plan.pupil, plan.rig.pupil_step()));
+        let inputs = match playback {
+            Some(playback) => Inputs::Recorded(playback),
+            None => Inputs::Followed(Followed {
+                pupil: tracker.estimate,
+                held: HeldPupil::default(),
+                pictures: pictures.source,
+                steering: Arc::clone(&steering),
+            }),
+        };
+        let pacer = Pacer::new(pacing, host_now());
+        let frames = start_frame_thread(&plan, inputs, renderer, output.frames, pacer, &engine, &stop)?;
+
+        let engine_now = engine.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        observer.began(&mut Began {
+            t_origin,
+            rig: plan.rig.clone(),
+            encoder: Arc::clone(&encoder),
+            engine: engine_now,
+            look: output.look,
+        });
+        let watch = Watch {
+            names: names_of(&plan, engine),
+            plays,
+            rings: Rings {
+                records: frames.records,
+                fields: output.events,
+                fields_over: Vec::new(),
+                box_events: output.box_events,
+                decisions: tracker.decisions,
+            },
+            panel: OutputWatch::new(output.panel_events, &plan.rig, output.takes_software_times),
+            laser_box: LaserBoxWatch::new(output.laser_faults, output.laser_watch),
+            tracker_watch: TrackerWatch::new(&plan.rig.tracker, tracker.control.figures(), t_origin),
+            tracker: tracker.control,
+            feed: pictures.feed,
+            feed_watch: FeedWatch::new(dark_after(&plan.pictures), t_origin),
+            record: plan.record,
+            desk: Desk::open(
+                preparer,
+                Changes { steering, sink: pictures.sink, places: frames.places, retired: frames.retired, weights },
+                &found,
+            ),
+            sleep: SleepWatch::begin(&plan.rig.lasers.driver),
+            signals,
+            hangups: plan.hangups,
+            service,
+            status: StatusFile::create(),
+            t_origin,
+            announced: Announced::new(advised),
+            tally: Tally::default(),
+            frame_rate: FrameRate::default(),
+            frames_shown_hz: None,
+            rig: plan.rig,
+            observer,
+        };
+        let (frame_thread, records_lost) = (frames.thread, frames.records_lost);
+        Ok(Session { watch, output: output.control, frame_thread, stop, records_lost, limits, encoder })
+    }
+
+    /// What makes requests ready, for what has been opened.
+    fn preparer(&self, plan: &SessionPlan, plays: bool) -> Preparer {
+        Preparer {
+            rig: plan.rig.clone(),
+            rig_again: plan.rig_again.clone(),
+            weights: Arc::new(Mutex::new(plan.rig.model.weights.clone())),
+            resolution: plan.pictures.resolution(),
+            frame: plan.pictures.first_frame(),
+            backend: plan.backend,
+            used_for: self.network.used_for.clone(),
+            encoder: Arc::clone(&self.network.encoder),
+            has_feed: self.pictures.feed.is_some(),
+            plays,
+            stall_timeout: self.bench.stall_timeout,
+            lasers: self.bench.output.control.dark_switch(),
+            dark_note: self.bench.dark_note.clone(),
+        }
+    }
+}
+
+/// The frame thread at work, and the control thread's ways to it.
+struct FrameThread {
+    thread: JoinHandle<Result<(), EngineError>>,
+    records: rtrb::Consumer<LoopRecord>,
+    records_lost: Arc<AtomicU64>,
+    places: rtrb::Producer<(u32, Change)>,
+    retired: rtrb::Consumer<Change>,
+}
+
+fn start_frame_thread(
+    plan: &SessionPlan,
+    inputs: Inputs,
+    renderer: Box<dyn Renderer>,
+    port: FramePort,
+    pacer: Pacer,
+    engine: &Arc<Mutex<String>>,
+    stop: &Arc<AtomicBool>,
+) -> Result<FrameThread, Failure> {
     let records_lost = Arc::new(AtomicU64::new(0));
     let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
-    let (places, change_consumer) = rtrb::RingBuffer::new(CHANGES);
+    let (places, changes) = rtrb::RingBuffer::new(CHANGES);
     // Beside these, one that the loop has in hand, and one that is sent since the retired ones were last taken.
     let (retired_producer, retired) = rtrb::RingBuffer::new(CHANGES + 2);
-    let steering = Arc::new(Steering::new(plan.pupil, rig.pupil_step()));
-    let weights = Arc::new(Mutex::new(rig.model.weights.clone()));
-    let preparer = Preparer {
-        rig: rig.clone(),
-        rig_again: plan.rig_again.clone(),
-        weights: Arc::clone(&weights),
-        resolution,
-        frame: plan.pictures.first_frame(),
-        backend: plan.backend,
-        used_for,
-        encoder: Arc::clone(&encoder),
-        has_feed: feed.is_some(),
-        plays,
-        stall_timeout: options.stall_timeout,
-        lasers: output.control.dark_switch(),
-        dark_note,
-    };
-    let inputs = match playback {
-        Some(playback) => Inputs::Recorded(playback),
-        None => Inputs::Followed(Followed {
-            pupil: estimates,
-            held: HeldPupil::default(),
-            pictures,
-            steering: Arc::clone(&steering),
-        }),
-    };
     let frame_loop = FrameLoop {
         inputs,
         renderer,
-        port: output.frames,
-        pacer: Pacer::new(pacing, host_now()),
-        light: rig.light(),
-        trained: TrainedPupils::of(plan.weights.trained_pupils(&rig.geometry)),
+        port,
+        pacer,
+        light: plan.rig.light(),
+        trained: TrainedPupils::of(plan.weights.trained_pupils(&plan.rig.geometry)),
         pattern: None,
         orders: FrameOrders::default(),
-        changes: change_consumer,
+        changes,
         retired: retired_producer,
         records: record_producer,
         records_lost: Arc::clone(&records_lost),
@@ -221,70 +366,43 @@ pub(super) fn build(
         made: None,
         engines_failed: 0,
         limit: plan.frame_limit,
-        engine: Arc::clone(&engine),
-        stop: Arc::clone(&stop),
+        engine: Arc::clone(engine),
+        stop: Arc::clone(stop),
     };
-    let frame_thread = std::thread::Builder::new()
+    let thread = std::thread::Builder::new()
         .name("holod-frame".into())
         .spawn(move || frame_loop.run())
         .map_err(Failure::because(Exit::Unavailable))?;
+    Ok(FrameThread { thread, records, records_lost, places, retired })
+}
 
-    let engine_now = engine.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    observer.began(&mut Began {
-        t_origin,
-        rig: plan.rig.clone(),
-        encoder: Arc::clone(&encoder),
-        engine: engine_now,
-        look: output.look,
-    });
-    let limits = Limits {
+fn limits_of(plan: &SessionPlan, playback: Option<&Playback>, t_origin: TimeNs) -> Limits {
+    let is_all = playback.is_some_and(|playback| plan.frame_limit == Some(playback.frames()));
+    Limits {
         t_origin,
         frames: plan.frame_limit,
-        frames_over,
+        frames_over: if is_all { "the end of the report" } else { "the asked number of frames" },
         duration: plan.duration,
-        replay_ends_run: !plays && replay_ends_run(&plan),
-    };
-    let names = Names {
-        scene,
-        scene_figures,
+        replay_ends_run: playback.is_none() && replay_ends_run(plan),
+    }
+}
+
+fn names_of(plan: &SessionPlan, engine: Arc<Mutex<String>>) -> Names {
+    Names {
+        scene: plan.pictures.name().to_owned(),
+        scene_figures: plan.pictures.figures(),
         tracker: plan.tracker.to_string(),
         panel: plan.output.to_string(),
         engine,
-        hologram: resolution,
-    };
-    let rings = Rings {
-        records,
-        fields: output.events,
-        fields_over: Vec::new(),
-        box_events: output.box_events,
-        decisions: tap,
-    };
-    let watch = Watch {
-        names,
-        plays,
-        rings,
-        panel: OutputWatch::new(output.panel_events, rig, output.takes_software_times),
-        laser_box: LaserBoxWatch::new(output.laser_faults, output.laser_watch),
-        tracker_watch: TrackerWatch::new(&rig.tracker, tracker.figures(), t_origin),
-        tracker,
-        feed,
-        feed_watch: FeedWatch::new(dark_after, t_origin),
-        record: plan.record,
-        desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }, &found),
-        sleep: SleepWatch::begin(&rig.lasers.driver),
-        signals,
-        hangups: plan.hangups,
-        service,
-        status: StatusFile::create(),
-        t_origin,
-        announced: Announced::new(advised),
-        tally: Tally::default(),
-        frame_rate: FrameRate::default(),
-        frames_shown_hz: None,
-        rig: plan.rig,
-        observer,
-    };
-    Ok(Session { watch, output: output.control, frame_thread, stop, records_lost, limits, encoder })
+        hologram: plan.pictures.resolution(),
+    }
+}
+
+fn dark_after(pictures: &Pictures) -> Option<TimeNs> {
+    match pictures {
+        Pictures::Feed(feed) => feed.dark_after,
+        Pictures::Scene(_) => None,
+    }
 }
 
 /// Says how many frames a second are to be expected. Whether it has said what would bring more.

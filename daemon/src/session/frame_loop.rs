@@ -85,6 +85,19 @@ pub(super) struct Made {
     levels_xxh3: Option<u64>,
 }
 
+/// The buffer that is submitted next, and what is in it.
+struct Filled {
+    is_hologram: bool,
+    /// The picture in hand, also where a pattern is in its place.
+    picture: PictureTag,
+    content: Content,
+    rendered: Rendered,
+    /// What was made last, where it has the same content.
+    again: Option<Made>,
+    /// The same where the buffer held it already.
+    there: Option<Made>,
+}
+
 /// What takes another's place in the loop, and what has made way for it.
 pub(super) enum Change {
     /// An engine, with the pupils that it knows.
@@ -145,14 +158,61 @@ impl FrameLoop {
         let mut pupil = self.inputs.pupil(t_wake, plan.t_predicted_photon);
 
         let t_render_begin = host_now();
-        let FrameContent { picture, mut tag, pattern } = self.inputs.content(plan.t_predicted_photon);
+        let filled = self.fill(plan.t_predicted_photon, pupil.pupil)?;
+        let t_render_end = host_now();
+
+        let made = self.number(&filled);
+        self.made = Some(made);
+        if !filled.is_hologram {
+            // A pattern rests on no sample.
+            (pupil.t_sample, pupil.raw_mm, pupil.estimate) = (None, None, None);
+        }
+        let is_kept = self.keep_levels && filled.is_hologram && pupil.is_meant();
+        let keep = if is_kept { keep_slot(pupil.pupil) } else { None };
+        if matches!(self.inputs, Inputs::Recorded(_)) {
+            self.wait_for_the_panel();
+        }
+        let t_submit = host_now();
+        let frame = FrameRecord {
+            frame: plan.frame_id,
+            t_sample: pupil.t_sample,
+            pupil_raw_mm: pupil.raw_mm,
+            pupil: pupil.pupil,
+            pupil_estimate: pupil.estimate,
+            pupil_state: pupil.state,
+            t_wake,
+            t_render_begin,
+            t_render_end,
+            t_submit,
+            t_desired_present: plan.t_desired_present,
+            picture: if filled.is_hologram { filled.picture } else { PictureTag::default() },
+            keep,
+            amplitude_constant: self.renderer.amplitude_constant(),
+            orders: self.orders,
+            levels_xxh3: made.levels_xxh3,
+            is_computed: filled.there.is_none(),
+        };
+        self.tell(frame, &filled);
+        self.port.submit(&plan, keep, t_submit);
+        match filled.there {
+            None => self.pacer.submitted(plan.frame_id, t_submit),
+            Some(_) => self.pacer.submitted_at_once(plan.frame_id, t_submit),
+        }
+        self.submitted = plan.frame_id;
+        self.hear_the_panel();
+        Ok(())
+    }
+
+    /// Fills the next buffer with the levels of what is to be seen at host time `t_photon`, for an eye with `pupil`;
+    /// what is in it already is not made again.
+    fn fill(&mut self, t_photon: TimeNs, pupil: PupilDiameter) -> Result<Filled, EngineError> {
+        let FrameContent { picture, tag, pattern } = self.inputs.content(t_photon);
         let pattern = pattern.or(self.pattern.as_deref());
         let is_hologram = pattern.is_none();
         self.orders.scene = tag.order;
         let FrameOrders { weights: weights_order, pattern: pattern_order, .. } = self.orders;
-        let (picture_tag, pupil_mm) = (tag, pupil.pupil);
         let content = |engines_failed| match is_hologram {
-            true => Content::Hologram { picture: picture_tag, pupil: pupil_mm, weights_order, engines_failed },
+            true => Content::Hologram { picture: tag, pupil, weights_order, engines_failed },
             false => Content::Pattern(pattern_order),
         };
         let again = self.made.filter(|made| made.content == content(self.engines_failed));
@@ -161,75 +221,48 @@ impl FrameLoop {
         let there = again.filter(|made| buffer.content() == Some(made.number));
         let rendered = match (there, pattern) {
             (Some(made), _) => made.rendered,
-            (None, None) => self.renderer.render(picture, pupil.pupil, buffer)?,
+            (None, None) => self.renderer.render(picture, pupil, buffer)?,
             (None, Some(pattern)) => {
                 buffer.copy_from(pattern);
                 Rendered::default()
             }
         };
-        let t_picture_in_hand = tag.t_came;
-        if !is_hologram {
-            (pupil.t_sample, pupil.raw_mm, pupil.estimate, tag) = (None, None, None, PictureTag::default());
-        }
         let engine_changed = there.is_none() && rendered.engine_changed;
         if engine_changed {
             self.engines_failed += 1;
             // It happens when a device is lost, which took longer than any lock.
             self.renderer.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
         }
-        let t_render_end = host_now();
+        let again = again.filter(|_| !engine_changed);
+        Ok(Filled { is_hologram, picture: tag, content: content(self.engines_failed), rendered, again, there })
+    }
 
-        let made = there.unwrap_or_else(|| {
-            let again = again.filter(|_| !engine_changed);
-            let number = again.map_or_else(|| self.made.map_or(1, |made| made.number + 1), |made| made.number);
-            let buffer = self.port.acquire();
-            buffer.call_content(number);
-            let levels_xxh3 = self.hash_levels.then(|| levels_xxh3(buffer));
-            Made { content: content(self.engines_failed), number, rendered, levels_xxh3 }
-        });
-        self.made = Some(made);
-        let keep = if self.keep_levels && is_hologram && pupil.is_meant() { keep_slot(pupil.pupil) } else { None };
-        if matches!(self.inputs, Inputs::Recorded(_)) {
-            self.wait_for_the_panel();
+    /// What the buffer holds, which is given its number where it was filled.
+    fn number(&mut self, filled: &Filled) -> Made {
+        if let Some(there) = filled.there {
+            return there;
         }
-        let t_submit = host_now();
+        let next = self.made.map_or(1, |made| made.number + 1);
+        let number = filled.again.map_or(next, |made| made.number);
+        let buffer = self.port.acquire();
+        buffer.call_content(number);
+        let levels_xxh3 = self.hash_levels.then(|| levels_xxh3(buffer));
+        Made { content: filled.content, number, rendered: filled.rendered, levels_xxh3 }
+    }
+
+    /// Hands what is to be said of a frame to the control thread.
+    fn tell(&mut self, frame: FrameRecord, filled: &Filled) {
         let record = LoopRecord {
-            frame: FrameRecord {
-                frame: plan.frame_id,
-                t_sample: pupil.t_sample,
-                pupil_raw_mm: pupil.raw_mm,
-                pupil: pupil.pupil,
-                pupil_estimate: pupil.estimate,
-                pupil_state: pupil.state,
-                t_wake,
-                t_render_begin,
-                t_render_end,
-                t_submit,
-                t_desired_present: plan.t_desired_present,
-                picture: tag,
-                keep,
-                amplitude_constant: self.renderer.amplitude_constant(),
-                orders: self.orders,
-                levels_xxh3: made.levels_xxh3,
-                is_computed: there.is_none(),
-            },
-            t_picture_in_hand,
-            beyond_trained: !self.trained.contain(pupil.pupil),
-            clipped_share: rendered.clipped_where_lit(self.light),
-            unreachable_share: rendered.unreachable_where_lit(self.light),
+            frame,
+            t_picture_in_hand: filled.picture.t_came,
+            beyond_trained: !self.trained.contain(frame.pupil),
+            clipped_share: filled.rendered.clipped_where_lit(self.light),
+            unreachable_share: filled.rendered.unreachable_where_lit(self.light),
         };
         // A full ring means that nobody records; the frame is shown all the same.
         if self.records.push(record).is_err() {
             self.records_lost.fetch_add(1, Ordering::Relaxed);
         }
-        self.port.submit(&plan, keep, t_submit);
-        match there {
-            None => self.pacer.submitted(plan.frame_id, t_submit),
-            Some(_) => self.pacer.submitted_at_once(plan.frame_id, t_submit),
-        }
-        self.submitted = plan.frame_id;
-        self.hear_the_panel();
-        Ok(())
     }
 
     fn hear_the_panel(&mut self) {

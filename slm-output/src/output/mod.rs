@@ -26,6 +26,7 @@ pub use self::shared::OutputCounts;
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::thread::JoinHandle;
 
 use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
@@ -37,7 +38,8 @@ use self::laser_thread::LaserThread;
 use self::ledger::Ledger;
 use self::panel_thread::PanelThread;
 use self::shared::Shared;
-use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserWatch};
+use crate::fields::FrameLayout;
+use crate::laser::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LaserWatch};
 use crate::levels::PanelEncoder;
 use crate::pacing::PacingConfig;
 use crate::present::{OpenError, PanelLook, PanelSetup, Presenter, Recorder, frame_channel, look};
@@ -123,15 +125,8 @@ impl Output {
         clock: Clock,
     ) -> Result<Self, OutputError> {
         let flat = PanelSetup::new(&rig.panel, encoder).flat;
-        let virtual_bench = panel.is_virtual() && laser.capability().simulated;
-        // A box with a wire to the panel's sync times its own windows, and in channel-packed mode the panel's own
-        // sequence says which colour each of them is for: that frames go by is all that must be known here.
-        let window_clock = WindowClock::of(&rig.panel, laser.capability());
-        let wired = !panel.is_virtual() && laser.capability().sync_wire && window_clock == WindowClock::Panel;
-        let evidence = if virtual_bench || wired { Evidence::Seen } else { Evidence::Stamped };
-        let (layout, stall_timeout) = (flat.layout(), options.stall_timeout);
-        let scheduler = FieldScheduler::new(&rig.panel, layout, &rig.lasers, evidence, window_clock, stall_timeout)?;
-        let program = scheduler.program(&rig.panel, &rig.lasers)?;
+        let Lighting { scheduler, program, takes_software_times } =
+            Lighting::of(rig, flat.layout(), panel.is_virtual(), laser.capability(), options.stall_timeout)?;
         laser.dark(DarkReason::Boot, clock())?;
         laser.program(&program, clock())?;
 
@@ -178,35 +173,69 @@ impl Output {
             shared: Arc::clone(&shared),
             clock,
         };
-        let spawned = std::thread::Builder::new().name("holod-panel".into()).spawn(move || panel_thread.run());
-        let panel = match spawned {
-            Ok(panel) => panel,
-            Err(why) => {
-                shared.stop.store(true, Ordering::Release);
-                laser.thread().unpark();
-                // A panic over there has been reported by the panic hook.
-                let _ended = laser.join();
-                return Err(why.into());
-            }
-        };
+        let threads = Threads::start_panel(laser, panel_thread)?;
         Ok(Self {
             frames: FramePort { sink, reports: report_consumer },
             events: event_consumer,
             box_events: box_consumer,
             panel_events: panel_consumer,
-            takes_software_times: evidence == Evidence::Seen,
+            takes_software_times,
             laser_faults: fault_consumer,
             laser_watch,
             look,
             control: OutputControl {
-                switch: DarkSwitch { shared, laser: laser.thread().clone() },
+                switch: DarkSwitch { shared, laser: threads.laser.thread().clone() },
                 doorbell,
                 frame_period: gate.timing().frame_period,
                 dark_wait,
-                threads: Some(Threads { panel, laser }),
+                threads: Some(threads),
                 clock,
             },
         })
+    }
+}
+
+impl Threads {
+    /// Starts the panel's thread; where it does not start, the lasers' is ended.
+    fn start_panel(laser: JoinHandle<()>, panel: PanelThread) -> Result<Self, OutputError> {
+        let shared = Arc::clone(&panel.shared);
+        match std::thread::Builder::new().name("holod-panel".into()).spawn(move || panel.run()) {
+            Ok(panel) => Ok(Self { panel, laser }),
+            Err(why) => {
+                shared.stop.store(true, Ordering::Release);
+                laser.thread().unpark();
+                // A panic over there has been reported by the panic hook.
+                let _ended = laser.join();
+                Err(why.into())
+            }
+        }
+    }
+}
+
+/// When lasers are lit over a panel.
+struct Lighting {
+    scheduler: FieldScheduler,
+    program: LaserProgram,
+    takes_software_times: bool,
+}
+
+impl Lighting {
+    fn of(
+        rig: &Rig,
+        layout: FrameLayout,
+        is_virtual: bool,
+        capability: Capability,
+        stall_timeout: TimeNs,
+    ) -> Result<Self, LaserError> {
+        let virtual_bench = is_virtual && capability.simulated;
+        // A box with a wire to the panel's sync times its own windows, and in channel-packed mode the panel's own
+        // sequence says which colour each of them is for: that frames go by is all that must be known here.
+        let window_clock = WindowClock::of(&rig.panel, capability);
+        let wired = !is_virtual && capability.sync_wire && window_clock == WindowClock::Panel;
+        let evidence = if virtual_bench || wired { Evidence::Seen } else { Evidence::Stamped };
+        let scheduler = FieldScheduler::new(&rig.panel, layout, &rig.lasers, evidence, window_clock, stall_timeout)?;
+        let program = scheduler.program(&rig.panel, &rig.lasers)?;
+        Ok(Self { scheduler, program, takes_software_times: evidence == Evidence::Seen })
     }
 }
 

@@ -6,11 +6,15 @@ use std::time::Duration;
 use holod_calibration::rig::{LaserDriver, Rig};
 use holod_calibration::{Colour, PerColour, TimeNs};
 use holod_pupil_input::host_now;
-use holod_slm_output::laser::{DarkReason, open_laser};
+use holod_slm_output::laser::{BoxEvent, DarkReason, open_laser};
 use holod_slm_output::output::{OutputError, pacing_config};
 use holod_slm_output::patterns::Placement;
 use holod_slm_output::present::{PanelSetup, open_panel};
-use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, PanelEncoder, PanelEvent};
+use holod_slm_output::{
+    FieldEvent, FramePlan, FramePort, LevelsFrame, Output, OutputControl, OutputOptions, OutputSpec, Pacer,
+    PanelEncoder, PanelEvent,
+};
+use rtrb::Consumer;
 use serde::{Serialize, Serializer};
 
 use crate::cli::PatternTarget;
@@ -73,9 +77,9 @@ pub(super) fn show(
 ) -> Result<Shown, Failure> {
     let mut signals = Signals::install(None)?;
     let pacing = pacing_config(rig, FIRST_COPY).map_err(Failure::because(Exit::Config))?;
-    let mut output = open(spec, rig, encoder).map_err(Failure::because(Exit::Unavailable))?;
+    let output = open(spec, rig, encoder).map_err(Failure::because(Exit::Unavailable))?;
     signals.end_after_lasers(&rig.lasers.driver);
-    let mut laser_box = LaserBoxWatch::new(output.laser_faults, output.laser_watch);
+    let laser_box = LaserBoxWatch::new(output.laser_faults, output.laser_watch);
     let switch = output.control.dark_switch();
     switch.install_panic_hook(host_now, || false);
     if to.dark {
@@ -85,82 +89,138 @@ pub(super) fn show(
             "lasers will be lit: an eye in the display may get all of their light in one spot; use a camera"
         );
     }
-    let mut sleep = SleepWatch::begin(&rig.lasers.driver);
+    let sleep = SleepWatch::begin(&rig.lasers.driver);
     sleep.may_be_lit(!to.dark);
     let planes = Colour::ALL.map(|colour| levels.unpack_colour(colour).levels);
     let t_begin = host_now();
-    let duration = to.duration.map(|duration| TimeNs(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)));
     let mut pacer = Pacer::new(pacing, t_begin);
+    let mut bench = Bench {
+        frames: output.frames,
+        fields: output.events,
+        box_events: output.box_events,
+        panel_events: output.panel_events,
+        control: output.control,
+        laser_box,
+        signals,
+        sleep,
+        is_dark: to.dark,
+        t_begin,
+        duration: to.duration.map(|duration| TimeNs(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX))),
+    };
     let has_power = rig.lasers.power_mw.map(|power_mw| power_mw > 0.0);
     let mut shown = Shown { has_power, ..Shown::default() };
-    let ended = 'frames: loop {
+    let ended = loop {
         let plan = pacer.predict(host_now());
+        if let Some(ended) = bench.wait_until(plan.t_wake) {
+            break ended;
+        }
+        bench.submit(&plan, &planes, &mut pacer);
+        if let Err(failed) = bench.drain(&mut shown) {
+            break Err(failed);
+        }
+    };
+    bench.end(shown, ended)
+}
+
+/// Panel and lasers while a pattern is shown, and what may end that.
+struct Bench {
+    frames: FramePort,
+    fields: Consumer<FieldEvent>,
+    box_events: Consumer<BoxEvent>,
+    panel_events: Consumer<PanelEvent>,
+    control: OutputControl,
+    laser_box: LaserBoxWatch,
+    signals: Signals,
+    sleep: SleepWatch,
+    /// A person wants no light.
+    is_dark: bool,
+    t_begin: TimeNs,
+    /// The asked time, from `t_begin` on.
+    duration: Option<TimeNs>,
+}
+
+impl Bench {
+    /// Waits until host time `t_wake`. Where something ends it all before: what.
+    fn wait_until(&mut self, t_wake: TimeNs) -> Option<Result<String, Failure>> {
+        let switch = self.control.dark_switch();
         loop {
             let now = host_now();
-            signals.tell_of_suspension();
-            if sleep.look() {
-                let wish = to.dark.then_some(DarkReason::Asked).or(sleep.keeps_dark());
-                sleep.told(wish, output.control.keep_dark(wish));
+            self.signals.tell_of_suspension();
+            if self.sleep.look() {
+                let wish = self.is_dark.then_some(DarkReason::Asked).or(self.sleep.keeps_dark());
+                self.sleep.told(wish, self.control.keep_dark(wish));
             }
-            if let Some(signal) = signals.caught() {
-                break 'frames Ok(signal.to_owned());
+            if let Some(signal) = self.signals.caught() {
+                return Some(Ok(signal.to_owned()));
             }
             if switch.reason() == Some(DarkReason::Panic) {
                 switch.wait_for_panic_message(host_now);
-                break 'frames Err(Failure::new(Exit::Software, "a thread failed (its message stands above)"));
+                return Some(Err(Failure::new(Exit::Software, "a thread failed (its message stands above)")));
             }
-            if duration.is_some_and(|duration| now - t_begin >= duration) {
-                break 'frames Ok("the asked duration".to_owned());
+            if self.duration.is_some_and(|duration| now - self.t_begin >= duration) {
+                return Some(Ok("the asked duration".to_owned()));
             }
-            if now >= plan.t_wake {
-                break;
+            if now >= t_wake {
+                return None;
             }
-            let sleep = (plan.t_wake - now).min(LONGEST_SLEEP);
+            let sleep = (t_wake - now).min(LONGEST_SLEEP);
             std::thread::sleep(Duration::from_nanos(sleep.0 as u64));
         }
-        let frame = output.frames.acquire();
+    }
+
+    fn submit(&mut self, plan: &FramePlan, planes: &[Vec<u16>], pacer: &mut Pacer) {
+        let frame = self.frames.acquire();
         for colour in Colour::ALL {
             frame.field_mut(colour).write(&planes[colour.index()]);
         }
         let now = host_now();
-        output.frames.submit(&plan, None, now);
+        self.frames.submit(plan, None, now);
         pacer.submitted(plan.frame_id, now);
-        output.frames.feed(&mut pacer, |_| ());
-        while let Ok(field) = output.events.pop() {
+        self.frames.feed(pacer, |_| ());
+    }
+
+    /// Takes note of what panel and lasers did; a panel that is lost for good ends it all.
+    fn drain(&mut self, shown: &mut Shown) -> Result<(), Failure> {
+        while let Ok(field) = self.fields.pop() {
             shown.fields[field.colour] += 1;
             shown.lit[field.colour] += u64::from(field.laser_on.is_some());
             shown.not_told[field.colour] += u64::from(field.laser_on.is_none() && field.dark.is_none());
             shown.dark = field.dark.or(shown.dark);
         }
-        while output.box_events.pop().is_ok() {}
-        laser_box.drain(output.control.counts().armed);
-        while let Ok(event) = output.panel_events.pop() {
+        while self.box_events.pop().is_ok() {}
+        self.laser_box.drain(self.control.counts().armed);
+        while let Ok(event) = self.panel_events.pop() {
             match event {
                 PanelEvent::Lost { fault, .. } if fault.is_recoverable() => {
                     tracing::error!("the panel is lost, lasers dark: {fault}");
                 }
                 PanelEvent::Lost { fault, .. } => {
-                    break 'frames Err(Failure::new(Exit::Unavailable, format!("the panel: {fault}")));
+                    return Err(Failure::new(Exit::Unavailable, format!("the panel: {fault}")));
                 }
                 PanelEvent::Back { .. } => tracing::info!("the panel is back"),
             }
         }
-    };
-    shown.duration_s = (host_now() - t_begin).seconds();
-    shown.refresh_hz = output.control.counts().refresh_hz;
-    signals.lasers_go_out();
-    let down = output.control.shutdown();
-    signals.lasers_are_out();
-    laser_box.drain(false);
-    if !down.panel_ended {
-        tracing::error!("{PANEL_HANGS}");
+        Ok(())
     }
-    if ended.is_err() && !down.lasers_dark {
-        tracing::error!("{}", not_dark(laser_box.trouble().unwrap_or(NO_ACKNOWLEDGEMENT)));
+
+    /// Puts the lasers out and ends the output.
+    fn end(mut self, mut shown: Shown, ended: Result<String, Failure>) -> Result<Shown, Failure> {
+        shown.duration_s = (host_now() - self.t_begin).seconds();
+        shown.refresh_hz = self.control.counts().refresh_hz;
+        self.signals.lasers_go_out();
+        let down = self.control.shutdown();
+        self.signals.lasers_are_out();
+        self.laser_box.drain(false);
+        if !down.panel_ended {
+            tracing::error!("{PANEL_HANGS}");
+        }
+        if ended.is_err() && !down.lasers_dark {
+            tracing::error!("{}", not_dark(self.laser_box.trouble().unwrap_or(NO_ACKNOWLEDGEMENT)));
+        }
+        shown.ended_by = ended?;
+        (shown.lasers_dark, shown.flat_presented) = (down.lasers_dark, down.flat_presented);
+        Ok(shown)
     }
-    shown.ended_by = ended?;
-    (shown.lasers_dark, shown.flat_presented) = (down.lasers_dark, down.flat_presented);
-    Ok(shown)
 }
 
 fn open(spec: &OutputSpec, rig: &Rig, encoder: &PanelEncoder) -> Result<Output, OutputError> {

@@ -63,56 +63,7 @@ impl Sight {
             let seen = orders.iter().filter(|order| order.share >= SHARE_MIN || order.number == [0, 0]);
             spots.extend(seen.map(|order| Spot::of(field, order)));
         }
-        let mut notes = Vec::new();
-        match *pattern {
-            Pattern::Level { .. } => notes.push("no pattern of phases: all light stays in the middle".into()),
-            Pattern::TwoLevels { .. } => notes.push(
-                "measure the power of one first order, behind a hole that keeps the middle away: it is largest where the \
-                 levels are π apart, and least where they are 0 or 2π apart; `holod lut` makes the table of it"
-                    .into(),
-            ),
-            Pattern::Checkerboard { .. } => notes.push(
-                "turn --depth until the middle is darkest: there the panel's own depth is π, and any other figure is the \
-                 stroke's error"
-                    .into(),
-            ),
-            Pattern::Grating { .. } => notes.push("light on the opposite side means that panel.phase_sign or panel.orientation is wrong".into()),
-            Pattern::Lens { focal_length: Metres(f_m), .. } => {
-                for &field in &fields {
-                    notes.push(lens_note(pattern, f_m, placement.axis_px, rig, field)?);
-                }
-                let eyepiece_m = optics.eyepiece_focal_length.0;
-                let (side, focus_dpt) = (if f_m > 0.0 { "in front of" } else { "behind" }, f_m / (eyepiece_m * eyepiece_m));
-                let seen = if CAMERA_DPT.contains(&focus_dpt) {
-                    format!("a camera in the display sees it sharp at {focus_dpt:.2} dioptres")
-                } else {
-                    let greatest_mm = 1e3 * CAMERA_DPT.end() * eyepiece_m * eyepiece_m;
-                    format!(
-                        "at {focus_dpt:.2} dioptres, where no usual camera in the display is sharp; focal lengths of \
-                         up to {greatest_mm:.1} mm are within {} dioptres",
-                        CAMERA_DPT.end()
-                    )
-                };
-                // Depth grows by the square of a relay's magnification.
-                let from_image_mm = 1e3 * f_m.abs() * rig.relay_magnification.powi(2);
-                notes.push(format!("the focus is {from_image_mm:.2} mm {side} the panel's image: {seen}"));
-            }
-            Pattern::Dots { spacing_px, .. } => {
-                let spacing_mrad = spacing_px as f64 * optics.pixel_angle_rad() * 1e3;
-                notes.push(format!("focus the camera at infinity: dots {spacing_mrad:.2} mrad apart, bright on black"));
-                notes.push("the middle dot is twice as wide; the one right of it and the second above it are left out".into());
-                notes.push("where others are missing, correct panel.orientation of the rig file".into());
-            }
-            Pattern::CrossHair { line_px } => {
-                let width_mrad = line_px as f64 * optics.pixel_angle_rad() * 1e3;
-                let [x_px, y_px] = placement.axis_px;
-                notes.push(format!(
-                    "focus the camera at infinity: lines {width_mrad:.2} mrad wide cross {x_px} px right of the panel's centre \
-                     and {y_px} px above it; the square is up and to the right"
-                ));
-            }
-            Pattern::FieldIdentity { .. } => notes.extend(identity_notes(pattern, rig, encoder, &fields)?),
-        }
+        let mut notes = pattern_notes(pattern, placement, rig, encoder, &fields)?;
         let unnamed = Colour::ALL.into_iter().filter(|&colour| !placement.colours[colour]).map(Colour::name);
         let unnamed: Vec<_> = unnamed.collect();
         if !unnamed.is_empty() {
@@ -135,6 +86,75 @@ impl Sight {
         }
         Ok(Self { pattern: pattern.to_string(), rig: rig.name.clone(), files: Vec::new(), spots, notes })
     }
+}
+
+/// What to look for and how, by the kind of pattern.
+fn pattern_notes(
+    pattern: &Pattern,
+    placement: &Placement,
+    rig: &Rig,
+    encoder: &PanelEncoder,
+    fields: &[Colour],
+) -> Result<Vec<String>, PatternError> {
+    let optics = &rig.geometry;
+    let width_mrad = |width_px: usize| width_px as f64 * optics.pixel_angle_rad() * 1e3;
+    let notes = match *pattern {
+        Pattern::Level { .. } => vec!["no pattern of phases: all light stays in the middle".into()],
+        Pattern::TwoLevels { .. } => vec![
+            "measure the power of one first order, behind a hole that keeps the middle away: it is largest where the \
+             levels are π apart, and least where they are 0 or 2π apart; `holod lut` makes the table of it"
+                .into(),
+        ],
+        Pattern::Checkerboard { .. } => vec![
+            "turn --depth until the middle is darkest: there the panel's own depth is π, and any other figure is the \
+             stroke's error"
+                .into(),
+        ],
+        Pattern::Grating { .. } => {
+            vec!["light on the opposite side means that panel.phase_sign or panel.orientation is wrong".into()]
+        }
+        Pattern::Lens { focal_length, .. } => {
+            let of_field = |&field| lens_note(pattern, focal_length.0, placement.axis_px, rig, field);
+            let mut notes = fields.iter().map(of_field).collect::<Result<Vec<_>, _>>()?;
+            notes.push(focus_note(focal_length, rig));
+            notes
+        }
+        Pattern::Dots { spacing_px, .. } => vec![
+            format!("focus the camera at infinity: dots {:.2} mrad apart, bright on black", width_mrad(spacing_px)),
+            "the middle dot is twice as wide; the one right of it and the second above it are left out".into(),
+            "where others are missing, correct panel.orientation of the rig file".into(),
+        ],
+        Pattern::CrossHair { line_px } => {
+            let [x_px, y_px] = placement.axis_px;
+            vec![format!(
+                "focus the camera at infinity: lines {:.2} mrad wide cross {x_px} px right of the panel's centre and \
+                 {y_px} px above it; the square is up and to the right",
+                width_mrad(line_px)
+            )]
+        }
+        Pattern::FieldIdentity { .. } => identity_notes(pattern, rig, encoder, fields)?,
+    };
+    Ok(notes)
+}
+
+/// Where a lens focuses, and whether a camera in the display sees it sharp.
+fn focus_note(Metres(focal_length_m): Metres, rig: &Rig) -> String {
+    let eyepiece_m = rig.geometry.eyepiece_focal_length.0;
+    let focus_dpt = focal_length_m / (eyepiece_m * eyepiece_m);
+    let side = if focal_length_m > 0.0 { "in front of" } else { "behind" };
+    let seen = if CAMERA_DPT.contains(&focus_dpt) {
+        format!("a camera in the display sees it sharp at {focus_dpt:.2} dioptres")
+    } else {
+        let greatest_mm = 1e3 * CAMERA_DPT.end() * eyepiece_m * eyepiece_m;
+        format!(
+            "at {focus_dpt:.2} dioptres, where no usual camera in the display is sharp; focal lengths of up to \
+             {greatest_mm:.1} mm are within {} dioptres",
+            CAMERA_DPT.end()
+        )
+    };
+    // Depth grows by the square of a relay's magnification.
+    let from_image_mm = 1e3 * focal_length_m.abs() * rig.relay_magnification.powi(2);
+    format!("the focus is {from_image_mm:.2} mm {side} the panel's image: {seen}")
 }
 
 /// What of a lens is left by panel and stop, and how sharp that makes its focus.

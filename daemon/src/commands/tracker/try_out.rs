@@ -133,6 +133,21 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         let text = text_of(&report);
         results::print(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())))?;
     }
+    refusals.judge(now, &tracker.control.counters(), true);
+    judge(&spec, &tracker, &observed, &refusals, report.trouble)
+}
+
+/// Whether samples were believed, and their recording is whole.
+///
+/// # Errors
+/// Why not, and what to do about it; `trouble` is why a link that was lost did not come back.
+fn judge(
+    spec: &TrackerSpec,
+    tracker: &TrackerHandle,
+    observed: &Observed,
+    refusals: &RefusalWatch,
+    trouble: Option<String>,
+) -> Result<(), Failure> {
     if let Some(failure) = tracker.control.recording().and_then(|recording| recording.failure) {
         return Err(Failure::new(Exit::CannotCreate, format!("the recording is not whole: {failure}")));
     }
@@ -142,14 +157,13 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     let counters = tracker.control.counters();
     // Logs and simulated eyes have no bytes.
     let [bytes, samples] = [Counter::Bytes, Counter::Samples].map(|counter| counters.of(counter));
-    refusals.judge(now, &counters, true);
-    let came = |refusal: &&Refusal| refusal.refused > 0 || bytes > 0 && report.trouble.is_none();
+    let came = |refusal: &&Refusal| refusal.refused > 0 || bytes > 0 && trouble.is_none();
     let heard = match refusals.current().filter(came) {
         Some(refusal) => refusal.to_string(),
         None if samples > 0 => {
             format!("{samples} samples came, and none was believed yet: give it a longer --duration")
         }
-        None => report.trouble.unwrap_or_else(|| {
+        None => trouble.unwrap_or_else(|| {
             "nothing was heard; is it switched on, and does it send without being asked?".to_owned()
         }),
     };
