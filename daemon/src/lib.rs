@@ -12,6 +12,7 @@ pub mod exposure;
 pub mod failure;
 #[cfg(feature = "fault-injection")]
 mod fault;
+mod frame_state;
 mod local_socket;
 pub mod logging;
 mod machine;

@@ -16,6 +16,7 @@ use holod_slm_output::{FieldEvent, LevelsFrame};
 use twox_hash::XxHash3_64;
 
 use crate::failure::{Exit, Failure};
+use crate::frame_state::FrameState;
 use crate::source::PictureTag;
 
 pub(crate) use self::folder::{EARLIER, RecordFolder};
@@ -39,8 +40,8 @@ pub struct FrameRecord {
     pub pupil: PupilDiameter,
     /// The tracker's estimate for the time at which the frame's light arrives, where that is followed.
     pub pupil_estimate: Option<PupilDiameter>,
-    /// Name of the estimator's state.
-    pub pupil_state: &'static str,
+    /// What `pupil` rests on.
+    pub pupil_state: FrameState,
     /// The loop woke for this frame.
     pub t_wake: TimeNs,
     pub t_render_begin: TimeNs,
@@ -75,7 +76,7 @@ impl FrameRecord {
             pupil_raw_mm: None,
             pupil,
             pupil_estimate: Some(pupil),
-            pupil_state: "tracking",
+            pupil_state: FrameState::Estimated(holod_pupil_input::PupilState::Tracking),
             t_wake: t,
             t_render_begin: t,
             t_render_end: t,

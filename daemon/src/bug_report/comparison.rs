@@ -180,11 +180,13 @@ impl Outcome {
 #[cfg(test)]
 mod tests {
     use holod_calibration::{PupilDiameter, TimeNs};
+    use holod_pupil_input::PupilState;
     use holod_slm_output::TimestampSource;
 
     use super::*;
     use crate::bug_report::recorded::Made;
     use crate::cli::Backend;
+    use crate::frame_state::FrameState;
     use crate::record::{FrameOrders, SceneSource};
 
     const COLOURS: [(u8, Colour); 3] = [(0, Colour::Green), (1, Colour::Red), (2, Colour::Blue)];
@@ -192,7 +194,7 @@ mod tests {
     fn made(levels_xxh3: u64) -> Made {
         Made {
             pupil: PupilDiameter::from_mm(3.0),
-            pupil_state: "tracking",
+            pupil_state: FrameState::Estimated(PupilState::Tracking),
             t_wake: TimeNs(1),
             picture: 0,
             is_live: false,
@@ -207,7 +209,7 @@ mod tests {
         let cue = |recorded: &RecordedFrame| Cue {
             frame: recorded.frame,
             pupil: PupilDiameter::from_mm(3.0),
-            pupil_state: "tracking",
+            pupil_state: FrameState::Estimated(PupilState::Tracking),
             picture: 0,
             number: 0,
             engine: 0,

@@ -12,8 +12,8 @@ use std::str::FromStr;
 use holod_calibration::{Colour, PupilDiameter, TimeNs};
 
 use crate::failure::{Exit, Failure};
+use crate::frame_state::FrameState;
 use crate::record::FrameOrders;
-use crate::session::pupil_state_named;
 
 /// Longer than any row.
 const LONGEST_ROW: u64 = 4096;
@@ -32,7 +32,7 @@ pub(super) struct RecordedFrame {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Made {
     pub(super) pupil: PupilDiameter,
-    pub(super) pupil_state: &'static str,
+    pub(super) pupil_state: FrameState,
     pub(super) t_wake: TimeNs,
     pub(super) picture: u64,
     /// Its picture came from a live feed.
@@ -106,7 +106,7 @@ impl Row<'_> {
             .map_err(|_| format!("levels_xxh3: found `{hash}`, expected hexadecimal digits"))?;
         Ok(Some(Made {
             pupil: PupilDiameter::from_mm(pupil_mm),
-            pupil_state: pupil_state_named(self.text("pupil_state")?),
+            pupil_state: FrameState::named(self.text("pupil_state")?),
             t_wake: TimeNs(t_wake_ns),
             picture: self.needed("picture")?,
             is_live: !self.text("t_picture_ns")?.is_empty(),

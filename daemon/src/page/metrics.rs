@@ -18,9 +18,9 @@ use prometheus_client::registry::{Registry, Unit};
 use self::process::OfProcess;
 use super::latencies::Latencies;
 use super::live::Live;
+use crate::frame_state::FrameState;
 use crate::logging;
 use crate::record::RecordCondition;
-use crate::session::pupil_states;
 use crate::snapshot::Snapshot;
 use crate::source::feed::FeedStatus;
 
@@ -139,7 +139,8 @@ fn of_states(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
         &["up", "silent", "down", "finished"],
         &snapshot.figures.tracker_link,
     )?;
-    told.states("pupil_state", "What the pupil rests on", &pupil_states(), &snapshot.pupil_state)?;
+    let pupil_states = FrameState::OF_A_RUN.map(FrameState::name);
+    told.states("pupil_state", "What the pupil rests on", &pupil_states, &snapshot.pupil_state)?;
     for (name, help, is_so) in [
         ("lasers_armed", "Whether lasers may be lit", snapshot.lasers == "armed"),
         ("lasers_kept_dark", "Whether a person keeps the lasers dark", snapshot.lasers_kept_dark),

@@ -105,7 +105,7 @@ impl Observer for Page {
             record.frame,
             self.seconds(record.t_wake),
             record.pupil.mm(),
-            record.pupil_state,
+            record.pupil_state.name(),
             milliseconds(record.t_wake, record.t_render_begin),
             milliseconds(record.t_render_begin, record.t_render_end),
             milliseconds(record.t_render_end, record.t_submit),

@@ -31,7 +31,7 @@ const COLUMNS: [(&str, Cell); 27] = [
     ("pupil_raw_mm", Frame(|frame| frame.pupil_raw_mm.map(|mm| format!("{mm:.4}")))),
     // The shortest text that reads back as the same bits.
     ("pupil_mm", Frame(|frame| Some(frame.pupil.mm().to_string()))),
-    ("pupil_state", Frame(|frame| Some(frame.pupil_state.into()))),
+    ("pupil_state", Frame(|frame| Some(frame.pupil_state.name().into()))),
     ("t_wake_ns", Frame(|frame| Some(nanoseconds(frame.t_wake)))),
     ("t_render_begin_ns", Frame(|frame| Some(nanoseconds(frame.t_render_begin)))),
     ("t_render_end_ns", Frame(|frame| Some(nanoseconds(frame.t_render_end)))),
@@ -196,8 +196,10 @@ mod tests {
     use std::os::fd::OwnedFd;
 
     use holod_calibration::{Colour, PupilDiameter};
+    use holod_pupil_input::PupilState;
 
     use super::*;
+    use crate::frame_state::FrameState;
     use crate::record::FrameOrders;
     use crate::source::{PictureTag, PictureView};
 
@@ -208,7 +210,7 @@ mod tests {
             pupil_raw_mm: Some(3.25),
             pupil: PupilDiameter::from_mm(3.3),
             pupil_estimate: Some(PupilDiameter::from_mm(3.25)),
-            pupil_state: "tracking",
+            pupil_state: FrameState::Estimated(PupilState::Tracking),
             t_wake: TimeNs(10),
             t_render_begin: TimeNs(11),
             t_render_end: TimeNs(20),

@@ -421,9 +421,11 @@ mod tests {
 
     use super::*;
     use crate::cli::Cli;
+    use crate::frame_state::FrameState;
     use crate::record::{FRAMES, FrameOrders, ORDERS, RecordCondition};
     use crate::source::PictureTag;
     use holod_calibration::PupilDiameter;
+    use holod_pupil_input::PupilState;
     use holod_slm_output::PanelEncoder;
 
     fn recorder(folder: &Path) -> Recorder {
@@ -446,7 +448,7 @@ mod tests {
             pupil_raw_mm: None,
             pupil: PupilDiameter::from_mm(3.0),
             pupil_estimate: None,
-            pupil_state: "tracking",
+            pupil_state: FrameState::Estimated(PupilState::Tracking),
             t_wake: TimeNs(1),
             t_render_begin: TimeNs(2),
             t_render_end: TimeNs(3),

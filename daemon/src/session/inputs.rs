@@ -9,26 +9,13 @@ use holod_slm_output::LevelsFrame;
 
 use super::held_pupil::HeldPupil;
 use crate::control::{NewEngine, Steering};
+use crate::frame_state::FrameState;
 use crate::record::FrameOrders;
 use crate::renderer::Renderer;
 use crate::source::{PictureSource, PictureTag};
 
 /// A pupil is not predicted farther ahead than this; slower frames use the prediction for this time.
 const FARTHEST_PREDICTION: TimeNs = TimeNs(200_000_000);
-
-/// What stands in place of the estimator's state where a person has fixed the pupil.
-pub(super) const FIXED_PUPIL: &str = "fixed";
-
-/// Every state of a frame's pupil.
-pub(crate) fn pupil_states() -> [&'static str; 5] {
-    let [acquiring, tracking, holding, fallback] = PupilState::ALL.map(PupilState::name);
-    [acquiring, tracking, holding, fallback, FIXED_PUPIL]
-}
-
-/// What a record calls an estimator's state; one that nobody knows is just a recorded one.
-pub(crate) fn pupil_state_named(name: &str) -> &'static str {
-    pupil_states().into_iter().find(|state| *state == name).unwrap_or("recorded")
-}
 
 /// Where pupils and pictures come from.
 pub(super) enum Inputs {
@@ -56,13 +43,13 @@ pub(super) struct FramePupil {
     pub(super) estimate: Option<PupilDiameter>,
     pub(super) t_sample: Option<TimeNs>,
     pub(super) raw_mm: Option<f32>,
-    pub(super) state: &'static str,
+    pub(super) state: FrameState,
 }
 
 impl FramePupil {
     /// Whether it is anything but the fallback.
     pub(super) fn is_meant(&self) -> bool {
-        self.state != PupilState::Fallback.name()
+        !self.state.is_fallback()
     }
 }
 
@@ -83,7 +70,13 @@ impl Inputs {
                 let estimate = followed.pupil.pupil_at(t_photon.min(t_wake + FARTHEST_PREDICTION));
                 if let Some(fixed) = followed.steering.fixed_pupil() {
                     let pupil = followed.held.take(fixed);
-                    return FramePupil { pupil, estimate: None, t_sample: None, raw_mm: None, state: FIXED_PUPIL };
+                    return FramePupil {
+                        pupil,
+                        estimate: None,
+                        t_sample: None,
+                        raw_mm: None,
+                        state: FrameState::Fixed,
+                    };
                 }
                 // No noise is in the fallback, and what it ends at is the rig's.
                 let pupil = match state {
@@ -95,7 +88,7 @@ impl Inputs {
                     estimate: Some(estimate.pupil),
                     t_sample: estimate.t_sample,
                     raw_mm: estimate.raw_mm,
-                    state: state.name(),
+                    state: FrameState::Estimated(state),
                 }
             }
             Self::Recorded(playback) => {
@@ -128,7 +121,7 @@ pub(crate) struct Cue {
     pub(crate) frame: u64,
     /// The pupil that it was made for.
     pub(crate) pupil: PupilDiameter,
-    pub(crate) pupil_state: &'static str,
+    pub(crate) pupil_state: FrameState,
     /// The place of its picture in [`Playback::pictures`].
     pub(crate) picture: usize,
     /// The picture's number in its scene.

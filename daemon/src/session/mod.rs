@@ -18,6 +18,7 @@ mod recorded_levels;
 pub(crate) mod scheduling;
 mod service;
 mod sleep;
+mod state;
 mod stats;
 mod summary;
 mod take_down;
@@ -27,7 +28,7 @@ mod watch;
 
 use crate::failure::Failure;
 
-pub(crate) use self::inputs::{Cue, Playback, pupil_state_named, pupil_states};
+pub(crate) use self::inputs::{Cue, Playback};
 pub(crate) use self::laser_watch::LaserBoxWatch;
 pub use self::ledger::LaserSummary;
 pub use self::observer::{Began, FirstLight, Observer};

@@ -84,7 +84,7 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
         fields_shown: tally.fields_shown,
         fields_repeated: tally.fields_repeated,
         frames_shown_hz: tally.frames_shown as f64 / duration_s,
-        frames_by_pupil_state: tally.by_state,
+        frames_by_pupil_state: tally.by_state.iter().map(|(state, frames)| (state.name(), *frames)).collect(),
         pupil_range_mm: tally.pupil_range_mm,
         frames_beyond_trained_pupils: tally.beyond_trained,
         samples_rejected: counters.refused_in_all(),

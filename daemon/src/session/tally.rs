@@ -1,6 +1,6 @@
 //! Running numbers of a run.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{HashMap, VecDeque};
 
 use holod_calibration::{PupilDiameter, TimeNs};
 use holod_slm_output::{FieldEvent, LevelsFrame};
@@ -11,6 +11,7 @@ use super::observer::FirstLight;
 use super::recorded_levels::KEEP_SLOTS;
 use super::stats::Recent;
 use super::summary::ShownLevels;
+use crate::frame_state::FrameState;
 use crate::record::FrameRecord;
 
 /// Frames whose fields may still come: all that the ring of records can hold at once, and some more.
@@ -31,14 +32,14 @@ pub(super) struct Tally {
     newest_made: u64,
     newest_shown: u64,
     newest_lit: u64,
-    pub(super) newest_state: &'static str,
+    pub(super) newest_state: Option<FrameState>,
     pub(super) frame_time: Recent,
     pub(super) sample_to_photon: Recent,
     pub(super) picture_to_photon: Recent,
     newest_picture: Option<TimeNs>,
     t_picture_in_hand: Option<TimeNs>,
     t_shown_begun: Option<TimeNs>,
-    pub(super) by_state: BTreeMap<&'static str, u64>,
+    pub(super) by_state: HashMap<FrameState, u64>,
     pub(super) pupil_range_mm: Option<[f32; 2]>,
     pub(super) beyond_trained: u64,
     pub(super) clipped_share_max: f32,
@@ -51,7 +52,7 @@ impl Tally {
         let frame = &record.frame;
         self.frames_made += 1;
         self.newest_made = frame.frame;
-        self.newest_state = frame.pupil_state;
+        self.newest_state = Some(frame.pupil_state);
         *self.by_state.entry(frame.pupil_state).or_default() += 1;
         if frame.is_computed {
             self.frames_computed += 1;

@@ -7,7 +7,7 @@ use std::time::Duration;
 use holod_calibration::rig::Rig;
 use holod_calibration::{Resolution, TimeNs};
 use holod_model::engine::EngineError;
-use holod_pupil_input::{Counter, DecisionTap, Link, PupilState, TrackerControl};
+use holod_pupil_input::{Counter, DecisionTap, TrackerControl};
 use holod_slm_output::laser::{BoxEvent, DarkReason};
 use holod_slm_output::output::OutputCounts;
 use holod_slm_output::{FieldEvent, OutputControl};
@@ -16,17 +16,18 @@ use super::clock::host_now;
 use super::desk::Desk;
 use super::feed_watch::{FeedSeen, FeedWatch};
 use super::frame_loop::LoopRecord;
-use super::inputs::FIXED_PUPIL;
 use super::laser_watch::LaserBoxWatch;
 use super::observer::Observer;
 use super::output_watch::OutputWatch;
 use super::rate_watch::RateWatch;
 use super::service::{Hangups, Service, Signals};
 use super::sleep::SleepWatch;
+use super::state::{Condition, State};
 use super::stats::FrameRate;
 use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
 use crate::failure::{Exit, Failure};
+use crate::frame_state::FrameState;
 use crate::record::RecordHealth;
 use crate::snapshot::{Figures, Snapshot};
 use crate::source::feed::Feed;
@@ -130,25 +131,6 @@ impl Announced {
             self.logged = Some((self.text.clone(), now));
         }
         is_due
-    }
-}
-
-/// The daemon's state, as `systemctl status` shows it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum State {
-    #[default]
-    Dark,
-    Running,
-    Degraded,
-}
-
-impl State {
-    const fn name(self) -> &'static str {
-        match self {
-            Self::Dark => "dark",
-            Self::Running => "running",
-            Self::Degraded => "degraded",
-        }
     }
 }
 
@@ -361,27 +343,15 @@ impl Watch<'_> {
 
     /// Says how the run is, where that has changed; whether it has.
     fn tell_state(&mut self, output: &OutputCounts, now: TimeNs) -> bool {
-        let lit = output.armed && self.tally.frames_shown > 0 && self.panel.unlit().is_none();
-        let link = self.tracker.link();
-        let is_fixed = self.tally.newest_state == FIXED_PUPIL;
-        let follows =
-            self.plays || is_fixed || link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
-        let record_lost = self.record.as_ref().is_some_and(|record| record.is_lost());
-        let state = match (lit, follows && !record_lost) {
-            (false, _) => State::Dark,
-            (true, false) => State::Degraded,
-            (true, true) => State::Running,
+        let condition = Condition {
+            is_lit: output.armed && self.tally.frames_shown > 0 && self.panel.unlit().is_none(),
+            plays: self.plays,
+            link: self.tracker.link(),
+            pupil: self.tally.newest_state,
+            record_lost: self.record.as_ref().is_some_and(|record| record.is_lost()),
         };
-        self.announced.state = state;
-        // A blink is no news; what the pupil falls back to is.
-        let pupil = match self.tally.newest_state {
-            "" => "not known yet",
-            FIXED_PUPIL => FIXED_PUPIL,
-            fallback if fallback == PupilState::Fallback.name() => fallback,
-            _ => "followed",
-        };
-        let record = if record_lost { ", record lost" } else { "" };
-        let text = format!("{}: tracker {}, pupil {pupil}{record}", state.name(), link.name());
+        self.announced.state = condition.state();
+        let text = condition.text();
         let is_new = text != self.announced.text;
         if is_new {
             self.service.status(&text);
@@ -445,7 +415,7 @@ impl Watch<'_> {
             lasers_kept_dark: self.desk.keeps_dark(),
             pattern: self.desk.pattern().map(str::to_owned),
             frames_shown_hz: self.frames_shown_hz,
-            pupil_state: self.tally.newest_state.to_owned(),
+            pupil_state: self.tally.newest_state.map_or("", FrameState::name).to_owned(),
             pupil_mm: self.tally.newest_pupil().map(|pupil| pupil.mm()),
             panel: self.names.panel.clone(),
             panel_trouble: self.panel.lost().map(|fault| fault.to_string()),
