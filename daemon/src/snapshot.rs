@@ -5,7 +5,6 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::record::RecordState;
 use crate::source::feed::FeedStatus;
 use crate::source::scene::SceneFigures;
 use crate::spread::Spread;
@@ -113,4 +112,42 @@ pub struct Snapshot {
     /// Why the live feed keeps lasers dark, where it does.
     #[serde(default)]
     pub feed_trouble: Option<String>,
+}
+
+/// How the record of a run is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RecordCondition {
+    /// It is written.
+    #[default]
+    Written,
+    /// It was given up.
+    Lost,
+}
+
+/// How the record of a run is, as its status says it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RecordState {
+    #[serde(serialize_with = "crate::results::path_text")]
+    pub folder: PathBuf,
+    /// Whether it goes on.
+    pub state: RecordCondition,
+    /// Why it was given up.
+    pub reason: Option<String>,
+    /// Rows that were left out because the disk was too slow.
+    pub rows_lost: u64,
+}
+
+impl RecordState {
+    /// The same in words.
+    pub fn text(&self) -> String {
+        let rows = match self.rows_lost {
+            0 => String::new(),
+            rows => format!("; {rows} rows are left out: the disk is too slow"),
+        };
+        match &self.reason {
+            Some(reason) => format!("lost: {reason}{rows}"),
+            None => format!("{}{rows}", self.folder.display()),
+        }
+    }
 }

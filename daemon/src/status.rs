@@ -322,7 +322,7 @@ mod tests {
     use std::time::SystemTime;
 
     use super::*;
-    use crate::record::RecordState;
+    use crate::snapshot::RecordState;
     use crate::source::feed::FeedStatus;
 
     const NOW: TimeNs = TimeNs(1_000_000_000_000);

@@ -8,7 +8,8 @@ use serde::Serialize;
 
 use super::recorded::RecordedFrame;
 use crate::failure::Failure;
-use crate::record::{FrameRecord, RunFacts, hash_text};
+use crate::frame_record::FrameRecord;
+use crate::record::{RunFacts, hash_text};
 use crate::session::{Cue, Observer};
 
 /// Differences that are told one by one.
@@ -186,8 +187,9 @@ mod tests {
     use super::*;
     use crate::bug_report::recorded::Made;
     use crate::cli::Backend;
+    use crate::frame_record::FrameOrders;
     use crate::frame_state::FrameState;
-    use crate::record::{FrameOrders, SceneSource};
+    use crate::record::SceneSource;
 
     const COLOURS: [(u8, Colour); 3] = [(0, Colour::Green), (1, Colour::Red), (2, Colour::Blue)];
 

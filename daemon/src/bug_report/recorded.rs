@@ -12,8 +12,8 @@ use std::str::FromStr;
 use holod_calibration::{Colour, PupilDiameter, TimeNs};
 
 use crate::failure::{Exit, Failure};
+use crate::frame_record::FrameOrders;
 use crate::frame_state::FrameState;
-use crate::record::FrameOrders;
 
 /// Longer than any row.
 const LONGEST_ROW: u64 = 4096;

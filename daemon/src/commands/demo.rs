@@ -13,10 +13,11 @@ use holod_slm_output::{FieldEvent, OutputSpec};
 
 use crate::cli::{Backend, DemoArgs, RigArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
+use crate::frame_record::FrameRecord;
 use crate::pictures::{
     Area, LatencyPlot, PupilPlot, PupilSampleMark, Sheet, Tile, phase_picture, screen_picture, shown_pattern,
 };
-use crate::record::{FieldRecord, FrameLog, FrameRecord};
+use crate::record::{FieldRecord, FrameLog};
 use crate::session::{self, FirstLight, Observer, SessionPlan, SessionReport, ShownLevels};
 use crate::source::{Pictures, scene};
 use crate::staging::Staging;

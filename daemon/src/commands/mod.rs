@@ -14,6 +14,7 @@ mod pattern;
 mod render;
 mod report;
 mod run;
+mod service_facts;
 mod status;
 mod tracker;
 mod unit;

@@ -10,7 +10,7 @@ use holod_pupil_input::{RecordFiles, ReplaySpeed, Tracker, TrackerSpec};
 use holod_slm_output::OutputSpec;
 use serde::Serialize;
 
-use super::check::access::files_of;
+use super::service_facts::files_of;
 use crate::aside;
 use crate::bug_report::{self, Outcome, Played};
 use crate::cli::{FitArg, LasersInstead, RunArgs};

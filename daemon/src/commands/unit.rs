@@ -11,19 +11,14 @@ use holod_pupil_input::TrackerSpec;
 use holod_slm_output::OutputSpec;
 use holod_slm_output::present::drm::DrmTarget;
 
-use super::check::access::{HIDDEN_FROM_SERVICE, files_of};
 use super::run;
+use super::service_facts::{BINARY, HIDDEN_FROM_SERVICE, STATE_FOLDER, USUAL_RIG, below, files_of};
 use crate::cli::{PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
 use crate::source::feed_socket;
 use crate::status::SERVICE_FOLDER;
 use crate::{results, setup};
 
-pub(super) const BINARY: &str = "/usr/bin/holod";
-/// The rig that the unit itself names.
-pub(super) const USUAL_RIG: &str = "/etc/holod/rig.toml";
-/// Where the unit lets holod write.
-pub(super) const STATE_FOLDER: &str = "/var/lib/holod";
 /// Networks that no address of the wider Internet is in.
 const PRIVATE_NETWORKS: &str = "link-local 192.168.0.0/16 10.0.0.0/8 172.16.0.0/12 fc00::/7";
 /// What a start waits for that fails where the network is not up.
@@ -292,10 +287,6 @@ pub(super) fn names(folder: &Path, prefix: &str) -> Vec<String> {
     let mut names: Vec<String> = names.filter(|name| name.starts_with(prefix)).collect();
     names.sort();
     names
-}
-
-pub(super) fn below(root: &Path, path: &Path) -> PathBuf {
-    root.join(path.strip_prefix("/").unwrap_or(path))
 }
 
 /// The sockets that the run makes by names of one's own, and what named them.

@@ -17,7 +17,7 @@ use crate::cli::{self, Backend, SceneArgs};
 use crate::dark_note::DarkNote;
 use crate::failure::Failure;
 use crate::renderer::{self, Renderer, Use};
-use crate::session::scheduling;
+use crate::scheduling;
 use crate::setup;
 use crate::source::scene;
 

@@ -15,8 +15,8 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 use rustix::process::setpriority_process;
 use tokio::sync::oneshot;
 
+use crate::frame_record::FrameRecord;
 use crate::pictures::{screen_picture, shown_pattern};
-use crate::record::FrameRecord;
 
 /// Pictures that may be asked for at once.
 const WAITING: usize = 4;

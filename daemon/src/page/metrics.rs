@@ -20,7 +20,7 @@ use super::latencies::Latencies;
 use super::live::Live;
 use crate::frame_state::FrameState;
 use crate::logging;
-use crate::record::RecordCondition;
+use crate::snapshot::RecordCondition;
 use crate::snapshot::Snapshot;
 use crate::source::feed::FeedStatus;
 
@@ -278,7 +278,7 @@ mod tests {
 
     use super::super::live::Refused;
     use super::*;
-    use crate::record::RecordState;
+    use crate::snapshot::RecordState;
     use crate::source::feed::ClippedPixels;
 
     #[test]

@@ -34,8 +34,8 @@ use self::live::{Batch, Light, Live, ShownField, TakenSample};
 use self::server::PageServer;
 use crate::cli::PageArgs;
 use crate::failure::{Exit, Failure};
+use crate::frame_record::FrameRecord;
 use crate::logging;
-use crate::record::FrameRecord;
 use crate::session::{Began, FirstLight, Observer};
 use crate::snapshot::Snapshot;
 

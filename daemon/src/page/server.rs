@@ -42,7 +42,7 @@ use super::live::{Live, Refused, Viewer};
 use super::metrics;
 use crate::cli::{focus_of_an_eye, human_pupil};
 use crate::local_socket::{self, LOOK, SocketPlace};
-use crate::session::scheduling;
+use crate::scheduling;
 use crate::snapshot::SnapshotNow;
 use crate::status::stale;
 

@@ -10,9 +10,10 @@ use holod_calibration::TimeNs;
 use super::health::lost;
 use super::place::judge_file;
 use super::sources::hash_text;
-use super::{FRAMES, FieldRecord, FrameRecord, ORDERS};
+use super::{FRAMES, FieldRecord, ORDERS};
 use crate::control::Request;
 use crate::failure::{Exit, Failure};
+use crate::frame_record::FrameRecord;
 
 use self::Cell::{Field, Frame};
 
@@ -199,8 +200,8 @@ mod tests {
     use holod_pupil_input::PupilState;
 
     use super::*;
+    use crate::frame_record::FrameOrders;
     use crate::frame_state::FrameState;
-    use crate::record::FrameOrders;
     use crate::source::{PictureTag, PictureView};
 
     fn frame(number: u64) -> FrameRecord {

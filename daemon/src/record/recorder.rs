@@ -16,15 +16,16 @@ use serde::{Deserialize, Serialize};
 
 use super::place::Place;
 use super::sources::{self, SceneSource, SourceFile, weights_file};
-use super::{FieldRecord, FrameLog, FrameRecord, RecordFolder, RecordHealth};
+use super::{FieldRecord, FrameLog, RecordFolder, RecordHealth};
 use crate::aside::{Queue, Taking, join_within};
 use crate::cli::{self, Backend, NetworkArgs, RigArgs, RunArgs, SceneArgs};
 use crate::control::Request;
 use crate::failure::{Exit, Failure};
+use crate::frame_record::FrameRecord;
 use crate::logging::LogFile;
 use crate::machine::Machine;
+use crate::observer::{Began, Observer};
 use crate::results;
-use crate::session::{Began, Observer};
 use crate::{setup, source};
 
 /// What a run was started with; `run.json`.
@@ -421,8 +422,10 @@ mod tests {
 
     use super::*;
     use crate::cli::Cli;
+    use crate::frame_record::FrameOrders;
     use crate::frame_state::FrameState;
-    use crate::record::{FRAMES, FrameOrders, ORDERS, RecordCondition};
+    use crate::record::{FRAMES, ORDERS};
+    use crate::snapshot::RecordCondition;
     use crate::source::PictureTag;
     use holod_calibration::PupilDiameter;
     use holod_pupil_input::PupilState;

@@ -14,7 +14,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use super::cpu::CpuRenderer;
 use super::{PLAYS_A_GPU, Rendered, Renderer, Use};
-use crate::session::scheduling;
+use crate::scheduling;
 
 /// An order to end the loop is seen within this time.
 const LOOK: Duration = Duration::from_millis(20);

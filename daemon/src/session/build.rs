@@ -22,11 +22,9 @@ use super::frame_loop::{Change, FrameLoop, LoopRecord, RECORDS};
 use super::held_pupil::HeldPupil;
 use super::inputs::{Followed, Inputs, Playback, TrainedPupils};
 use super::laser_watch::LaserBoxWatch;
-use super::observer::{Began, Observer};
 use super::output_watch::OutputWatch;
 use super::plan::SessionPlan;
 use super::recorded_levels::KEEP_SLOTS;
-use super::scheduling;
 use super::service::{Service, Signals};
 use super::sleep::SleepWatch;
 use super::stats::FrameRate;
@@ -36,12 +34,13 @@ use super::watch::{Announced, Limits, Names, Rings, Watch};
 use crate::control::{self, Preparer, Steering};
 use crate::dark_note::{DarkNote, Found};
 use crate::failure::{Exit, Failure};
-use crate::record::FrameOrders;
+use crate::frame_record::FrameOrders;
+use crate::observer::{Began, Observer};
 use crate::renderer::{self, Renderer, Use};
 use crate::service_lasers::ServiceLasers;
 use crate::source::{OpenPictures, Pictures};
 use crate::status::{self, StatusFile};
-use crate::{progress, setup, source, speed};
+use crate::{progress, scheduling, setup, source, speed};
 
 /// Lasers go dark when one frame has stayed on the panel for so many frame times, within these limits.
 const STALL_FRAMES: i64 = 6;

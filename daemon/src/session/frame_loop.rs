@@ -11,7 +11,7 @@ use holod_slm_output::{FramePlan, FramePort, LevelsFrame, Pacer};
 use super::clock::host_now;
 use super::inputs::{FrameContent, Inputs, TrainedPupils};
 use super::recorded_levels::keep_slot;
-use crate::record::{FrameOrders, FrameRecord, levels_xxh3};
+use crate::frame_record::{FrameOrders, FrameRecord, levels_xxh3};
 use crate::renderer::{Rendered, Renderer};
 use crate::source::PictureTag;
 

@@ -9,8 +9,8 @@ use holod_slm_output::LevelsFrame;
 
 use super::held_pupil::HeldPupil;
 use crate::control::{NewEngine, Steering};
+use crate::frame_record::FrameOrders;
 use crate::frame_state::FrameState;
-use crate::record::FrameOrders;
 use crate::renderer::Renderer;
 use crate::source::{PictureSource, PictureTag};
 

@@ -10,12 +10,10 @@ mod inputs;
 mod laser_watch;
 mod ledger;
 mod obey;
-mod observer;
 mod output_watch;
 mod plan;
 mod rate_watch;
 mod recorded_levels;
-pub(crate) mod scheduling;
 mod service;
 mod sleep;
 mod state;
@@ -31,13 +29,13 @@ use crate::failure::Failure;
 pub(crate) use self::inputs::{Cue, Playback};
 pub(crate) use self::laser_watch::LaserBoxWatch;
 pub use self::ledger::LaserSummary;
-pub use self::observer::{Began, FirstLight, Observer};
 pub use self::plan::SessionPlan;
 pub use self::service::Hangups;
 pub(crate) use self::service::Signals;
 pub(crate) use self::sleep::SleepWatch;
 pub use self::summary::{SessionReport, ShownLevels, Summary};
 pub use self::take_down::{NO_ACKNOWLEDGEMENT, PANEL_HANGS, not_dark};
+pub use crate::observer::{Began, FirstLight, Observer};
 
 /// Runs until a limit, a signal or a failure ends it; lasers are dark when it returns.
 ///

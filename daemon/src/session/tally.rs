@@ -7,12 +7,12 @@ use holod_slm_output::{FieldEvent, LevelsFrame};
 
 use super::frame_loop::{LoopRecord, RECORDS};
 use super::ledger::LaserLedger;
-use super::observer::FirstLight;
 use super::recorded_levels::KEEP_SLOTS;
 use super::stats::Recent;
 use super::summary::ShownLevels;
+use crate::frame_record::FrameRecord;
 use crate::frame_state::FrameState;
-use crate::record::FrameRecord;
+use crate::observer::FirstLight;
 
 /// Frames whose fields may still come: all that the ring of records can hold at once, and some more.
 const REMEMBERED: usize = RECORDS + 64;

@@ -5,20 +5,20 @@ use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{Rig, WeightsChoice};
+use holod_calibration::rig::Rig;
 use holod_pupil_input::TrackerSpec;
 use rustix::fs::Access;
 use rustix::process::{Resource, getrlimit};
 
 use super::Check;
+use crate::commands::service_facts::{HIDDEN_FROM_SERVICE, files_of};
+use crate::scheduling;
 
 const SERVICE_USER: &str = "holod";
 /// The groups that the unit adds.
 const SERVICE_GROUPS: [&str; 3] = ["dialout", "video", "render"];
-/// What the unit hides (`ProtectHome=`, `PrivateTmp=`).
-pub(in crate::commands) const HIDDEN_FROM_SERVICE: [&str; 5] = ["/home", "/root", "/run/user", "/tmp", "/var/tmp"];
 /// What the panel's, lasers' and tracker's threads ask for.
-pub(super) const REALTIME_PRIORITY: u64 = 10;
+pub(super) const REALTIME_PRIORITY: u64 = scheduling::REALTIME_PRIORITY as u64;
 
 /// Who is to run holod.
 #[derive(Debug)]
@@ -122,24 +122,6 @@ fn files(rig: &Rig, runner: &Runner) -> Result<String, Vec<String>> {
     }
 }
 
-/// The rig file and those that it names.
-pub(in crate::commands) fn files_of(rig: &Rig) -> Vec<PathBuf> {
-    let provenance = &rig.provenance;
-    let origin = Some(PathBuf::from(&provenance.origin)).filter(|path| path.is_file());
-    let weights = match &rig.model.weights {
-        WeightsChoice::File(path) => Some(path.clone()),
-        _ => None,
-    };
-    let tables = provenance.lut_files.0.iter().chain(&provenance.flatness_files.0).flatten();
-    let tables = tables.map(|table| table.path.clone());
-    let lasers = provenance.laser_profile_file.clone();
-    let tracker = rig.tracker.spec.as_ref().and_then(|spec| spec.parse::<TrackerSpec>().ok());
-    let tracker = tracker.map(|spec| spec.files()).unwrap_or_default();
-    // A file that is named from where the caller stands is elsewhere for the service.
-    let files = origin.into_iter().chain(weights).chain(tables).chain(lasers).chain(tracker);
-    files.map(|path| std::path::absolute(&path).unwrap_or(path)).collect()
-}
-
 /// A warning where it is not allowed: a bench that nothing else runs on is on time without.
 fn realtime(limit: Option<u64>) -> Check {
     let says = match limit {
@@ -223,7 +205,7 @@ fn group_name(gid: u32, root: &Path) -> Option<String> {
 mod tests {
     use std::os::unix::fs::PermissionsExt;
 
-    use holod_calibration::rig::LaserDriver;
+    use holod_calibration::rig::{LaserDriver, WeightsChoice};
 
     use super::*;
 

@@ -9,7 +9,8 @@ use holod_calibration::rig::Rig;
 
 use super::Check;
 use super::access::{named, serial_ports_of};
-use crate::commands::unit::{below, names};
+use crate::commands::service_facts::below;
+use crate::commands::unit::names;
 
 /// A process, by its number and name.
 #[derive(Clone, Debug, PartialEq, Eq)]

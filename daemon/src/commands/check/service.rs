@@ -14,7 +14,8 @@ use rustix::fs::Access;
 use super::Check;
 use super::access::{REALTIME_PRIORITY, Runner, cure, named, serial_ports_of};
 use crate::cli::{CheckArgs, Cli, Command, RunArgs};
-use crate::commands::unit::{BINARY, STATE_FOLDER, USUAL_RIG, below, drop_in, names, unquoted, visible_paths};
+use crate::commands::service_facts::{BINARY, STATE_FOLDER, USUAL_RIG, below};
+use crate::commands::unit::{drop_in, names, unquoted, visible_paths};
 
 /// Where units are, the first that has one counts; drop-ins of all of them do.
 const UNIT_FOLDERS: [&str; 4] =

@@ -10,7 +10,7 @@ use holod_slm_output::{FieldEvent, PanelEncoder};
 
 use crate::control::Request;
 use crate::failure::Failure;
-use crate::record::FrameRecord;
+use crate::frame_record::FrameRecord;
 use crate::snapshot::Snapshot;
 
 /// Hears of everything in the run, on the control thread.

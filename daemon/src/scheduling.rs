@@ -10,12 +10,12 @@ use thread_priority::{
 };
 
 /// Modest on purpose: above every ordinary thread, below the kernel's own.
-const REALTIME_PRIORITY: u8 = 10;
+pub(crate) const REALTIME_PRIORITY: u8 = 10;
 const WORKER_NICENESS: i32 = 5;
 
 /// Creates a part whose threads wake at once when it is their time. Without the right to real-time scheduling they run
 /// as ordinary threads, and a warning says so.
-pub(super) fn prompt<T: Send>(make: impl FnOnce() -> T + Send) -> T {
+pub(crate) fn prompt<T: Send>(make: impl FnOnce() -> T + Send) -> T {
     on_thread_with(raise, make)
 }
 
@@ -30,7 +30,7 @@ pub(crate) fn patient<T: Send>(make: impl FnOnce() -> T + Send) -> T {
 }
 
 /// Makes the calling thread wake at once when it is its time, as in [`prompt`].
-pub(super) fn raise() {
+pub(crate) fn raise() {
     let priority = ThreadPriority::Crossplatform(REALTIME_PRIORITY.try_into().expect("a priority below 100"));
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     if let Err(error) = set_thread_priority_and_policy(thread_native_id(), priority, policy) {
