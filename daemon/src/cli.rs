@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 pub use crate::page::PageAddress;
 
-pub use self::pattern::{ColourArg, PatternKind, PatternPlace, PatternTarget, ProfileArg};
+pub use self::pattern::{PatternKind, PatternPlace, PatternTarget, ProfileArg};
 
 /// Drives a holographic near-eye display in real time, closed loop with an eye tracker.
 ///

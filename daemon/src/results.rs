@@ -72,6 +72,11 @@ fn save(bytes: &[u8], path: &Path) -> Result<(), Failure> {
     write_atomically(path, |out| out.write_all(bytes)).map_err(cannot)
 }
 
+/// The last part of a path, whatever bytes are in it.
+pub(crate) fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
 /// Writes a path as text, whatever bytes are in it: JSON knows no others.
 pub(crate) fn path_text<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
     path.to_string_lossy().serialize(serializer)

@@ -58,6 +58,7 @@ pub(crate) fn summary_text(summary: &Summary) -> String {
         0 => String::new(),
         fields => format!("; of {fields} more the lasers tell nothing, they are simply on"),
     };
+    let box_lost = lasers.box_lost.map_or(String::new(), |lost| format!("; {}", lost.text()));
     format!(
         "ended by {} after {:.1} s\n\
          frames    {} made, {} of them computed, {} shown ({} late), {:.1} a second of the panel's {:.1}; {} colour fields shown, {} of them \
@@ -65,7 +66,7 @@ pub(crate) fn summary_text(summary: &Summary) -> String {
          pupil     {pupils}; frames: {}\n\
          tracker   {}: link {}, {} samples, {} rejected{trouble}{feed}\n\
          time      per frame {}; tracker sample to photons {}\n\
-         lasers    {} fields judged: {} lit by their own colour, {} kept dark, {} faults of which {} unsafe{not_told}\n\
+         lasers    {} fields judged: {} lit by their own colour, {} kept dark, {} faults of which {} unsafe{not_told}{box_lost}\n\
          shutdown  lasers dark: {}; flat pattern on the panel: {}{record}",
         summary.ended_by,
         summary.duration_s,

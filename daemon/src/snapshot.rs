@@ -114,6 +114,17 @@ pub struct Snapshot {
     pub feed_trouble: Option<String>,
 }
 
+impl Snapshot {
+    /// The frames, the pupil and the lasers in one line.
+    pub(crate) fn in_short(&self) -> String {
+        let rate = self.frames_shown_hz.map_or(String::new(), |hz| format!(", {hz:.1} a second"));
+        let pupil = self.pupil_mm.map_or("not known yet".to_owned(), |mm| format!("{mm:.2} mm, {}", self.pupil_state));
+        let Figures { frames_made, frames_shown, .. } = self.figures;
+        let (state, lasers) = (&self.state, &self.lasers);
+        format!("{state}: {frames_made} frames made, {frames_shown} shown{rate}; pupil {pupil}; lasers {lasers}")
+    }
+}
+
 /// How the record of a run is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -149,5 +160,23 @@ impl RecordState {
             Some(reason) => format!("lost: {reason}{rows}"),
             None => format!("{}{rows}", self.folder.display()),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_in_short_has_figures_as_far_as_they_are_known() {
+        let mut snapshot = Snapshot { state: "dark".into(), lasers: "dark".into(), ..Snapshot::default() };
+        assert_eq!(snapshot.in_short(), "dark: 0 frames made, 0 shown; pupil not known yet; lasers dark");
+        (snapshot.figures.frames_made, snapshot.figures.frames_shown) = (12, 10);
+        (snapshot.frames_shown_hz, snapshot.pupil_mm) = (Some(4.98), Some(4.981_247_4));
+        snapshot.pupil_state = "tracking".into();
+        assert_eq!(
+            snapshot.in_short(),
+            "dark: 12 frames made, 10 shown, 5.0 a second; pupil 4.98 mm, tracking; lasers dark"
+        );
     }
 }

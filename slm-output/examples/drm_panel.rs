@@ -109,12 +109,9 @@ fn parse_options(words: &[&str]) -> Result<Options, Box<dyn Error>> {
 fn parse_panel(mode: &str, panel_mode: &str) -> Result<(Panel, Resolution), Box<dyn Error>> {
     let (size, refresh_hz) = mode.split_once('@').ok_or("WIDTHxHEIGHT@HZ")?;
     let (width, height) = size.split_once('x').ok_or("WIDTHxHEIGHT@HZ")?;
-    let mode = match panel_mode {
-        "channel-packed" => PanelMode::ChannelPacked,
-        "field-sequential" => PanelMode::FieldSequential,
-        "monochrome" => PanelMode::Monochrome(Colour::Green),
-        other => return Err(format!("no panel mode is `{other}`").into()),
-    };
+    let modes = [PanelMode::ChannelPacked, PanelMode::FieldSequential, PanelMode::Monochrome(Colour::Green)];
+    let mode = modes.into_iter().find(|mode| mode.name() == panel_mode);
+    let mode = mode.ok_or_else(|| format!("no panel mode is `{panel_mode}`"))?;
     let panel = Panel { refresh_hz: refresh_hz.parse()?, mode, ..Rig::default().panel };
     Ok((panel, Resolution { width: width.parse()?, height: height.parse()? }))
 }

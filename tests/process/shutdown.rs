@@ -360,6 +360,8 @@ fn an_unplugged_laser_box_is_named_at_once_and_lit_again_when_it_is_back() {
     assert!(ended.stderr.contains("the laser box is lost, lasers dark: "), "{}", ended.stderr);
     assert!(ended.stderr.contains("the laser box is back"), "{}", ended.stderr);
     assert!(ended.stdout.contains("lasers dark: true"), "{}", ended.stdout);
+    let lasers = ended.stdout.lines().find(|line| line.starts_with("lasers    ")).expect("a line on the lasers");
+    assert!(lasers.contains("; lasers lost") && lasers.ends_with(", back"), "{lasers}");
     laser_box.assert_dark();
 }
 
@@ -398,6 +400,7 @@ fn a_run_whose_laser_box_does_not_acknowledge_darkness_says_so_and_fails() {
     let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
     assert_eq!(summary["lasers_dark_at_end"], false);
     assert!(summary["lasers_not_dark"].as_str().unwrap().contains("lasers.device"), "{summary:#}");
+    assert_eq!(summary["lasers"]["box_lost"]["is_back"], false, "{summary:#}");
 }
 
 #[test]

@@ -4,6 +4,7 @@ use std::f64::consts::PI;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Subcommand, ValueEnum};
 use holod_calibration::{Colour, Metres};
 use holod_slm_output::patterns::{Pattern, Profile};
@@ -163,18 +164,11 @@ impl<To: Args> From<&PatternKind<To>> for Pattern {
 pub struct PatternPlace {
     /// Colours that have the pattern, the others are flat; all of them when left out. `holod pattern` keeps the lasers of
     /// the others dark, a run (`holod ctl pattern`) lights them.
-    #[arg(long, value_enum, value_name = "COLOUR", num_args = 1.., value_delimiter = ',')]
-    pub colour: Vec<ColourArg>,
+    #[arg(long, value_parser = colour(), value_name = "COLOUR", num_args = 1.., value_delimiter = ',')]
+    pub colour: Vec<Colour>,
     /// The optical axis in pixels from the panel's centre, right and up: the middle of lens, dots and cross-hair.
     #[arg(long, value_name = "X,Y", default_value = "0,0", value_parser = parse_axis, allow_hyphen_values = true)]
     pub axis: [f64; 2],
-}
-
-impl PatternPlace {
-    /// The colours that are named.
-    pub fn colours(&self) -> Vec<Colour> {
-        self.colour.iter().copied().map(Colour::from).collect()
-    }
 }
 
 /// Where a pattern goes.
@@ -228,23 +222,11 @@ impl From<ProfileArg> for Profile {
     }
 }
 
-/// A colour by name.
-#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
-#[expect(missing_docs, reason = "the names say it")]
-pub enum ColourArg {
-    Red,
-    Green,
-    Blue,
-}
-
-impl From<ColourArg> for Colour {
-    fn from(colour: ColourArg) -> Self {
-        match colour {
-            ColourArg::Red => Self::Red,
-            ColourArg::Green => Self::Green,
-            ColourArg::Blue => Self::Blue,
-        }
-    }
+fn colour() -> impl TypedValueParser<Value = Colour> {
+    PossibleValuesParser::new(Colour::ALL.map(Colour::name)).map(|name| {
+        let named = Colour::ALL.into_iter().find(|colour| colour.name() == name);
+        named.expect("the parser takes these names alone")
+    })
 }
 
 fn parse_axis(text: &str) -> Result<[f64; 2], String> {
@@ -275,7 +257,7 @@ mod tests {
         };
         assert_eq!(
             (angle, to.place.axis, to.place.colour.as_slice()),
-            (-30.0, [-3.0, 4.5], &[ColourArg::Red, ColourArg::Blue][..])
+            (-30.0, [-3.0, 4.5], &[Colour::Red, Colour::Blue][..])
         );
         let lens = Pattern::from(&parsed("holod pattern lens --focal-length -20 --diameter 2").unwrap());
         assert_eq!(lens, Pattern::Lens { focal_length: Metres(-0.02), diameter: Some(Metres(0.002)) });

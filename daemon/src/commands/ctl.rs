@@ -47,9 +47,11 @@ fn request(order: &CtlOrder) -> Result<Request, Failure> {
         CtlOrder::Resume => Request::Resume {},
         CtlOrder::Pupil { pupil: PupilOrder::Follow } => Request::Pupil { mm: None },
         CtlOrder::Pupil { pupil: PupilOrder::Fixed(pupil) } => Request::Pupil { mm: Some(pupil.mm()) },
-        CtlOrder::Pattern(kind) => {
-            Request::Pattern { pattern: kind.into(), axis_px: kind.target().axis, colours: kind.target().colours() }
-        }
+        CtlOrder::Pattern(kind) => Request::Pattern {
+            pattern: kind.into(),
+            axis_px: kind.target().axis,
+            colours: kind.target().colour.clone(),
+        },
         CtlOrder::Eye { eye } => Request::Eye { eye: *eye },
         CtlOrder::Reload => Request::Reload { changed: BTreeMap::new() },
         CtlOrder::Flat => Request::Flat {},

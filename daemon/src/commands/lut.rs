@@ -47,7 +47,7 @@ pub(super) fn lut(args: &LutArgs) -> Result<(), Failure> {
         PhaseSign::Positive => 1.0,
         PhaseSign::Negative => -1.0,
     };
-    let mut text = format!("# By `holod lut` from {}\nlevel,phase_rad\n", file_name(&args.powers));
+    let mut text = format!("# By `holod lut` from {}\nlevel,phase_rad\n", results::file_name(&args.powers));
     for (level, phase_rad) in fit.phases_rad.iter().enumerate() {
         // Adding 0 keeps level 0 from being written as -0.
         let _ = writeln!(text, "{level},{:.5}", sign * phase_rad + 0.0);
@@ -82,10 +82,6 @@ fn warn(fit: &LutFit) {
             percent(fit.background)
         );
     }
-}
-
-fn file_name(path: &Path) -> String {
-    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// Reads rows `level,power`, with an optional header line and `#` comments.

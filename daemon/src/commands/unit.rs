@@ -223,7 +223,7 @@ fn serial_class(port: &Path, what: &str, root: &Path) -> Result<Option<String>, 
         let port = port.display();
         Failure::new(Exit::Unavailable, format!("{port}: {error}: plug {what} in, its adapter says what to allow"))
     })?;
-    let name = node.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let name = results::file_name(&node);
     Ok(match name.trim_end_matches(|c: char| c.is_ascii_digit()) {
         class @ ("ttyUSB" | "ttyACM") => Some(format!("char-{class}")),
         // A pseudo-terminal, which the unit allows anyway.

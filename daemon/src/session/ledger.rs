@@ -8,6 +8,8 @@ use holod_slm_output::laser::verify::{FieldSpan, verify_edges};
 use holod_slm_output::laser::{BoxEvent, LaserEdge};
 use serde::Serialize;
 
+use super::laser_watch::BoxLost;
+
 /// Fields that wait before they are judged, so that the edges that belong to them have come.
 const WAITING_FIELDS: usize = 600;
 /// Findings that are kept word for word.
@@ -41,6 +43,8 @@ pub struct LaserSummary {
     pub went_dark_in_all: usize,
     /// Times and reasons of going dark, newest last: the first ten and the newest ten.
     pub went_dark: Vec<String>,
+    /// That the box was lost, where it was.
+    pub box_lost: Option<BoxLost>,
 }
 
 /// Collects fields and edges and judges them in batches.

@@ -27,6 +27,7 @@ mod watch;
 use crate::failure::Failure;
 
 pub(crate) use self::inputs::{Cue, Playback};
+pub use self::laser_watch::BoxLost;
 pub(crate) use self::laser_watch::LaserBoxWatch;
 pub use self::ledger::LaserSummary;
 pub use self::plan::SessionPlan;

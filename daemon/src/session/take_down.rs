@@ -36,7 +36,9 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
     let tracker_link = watch.tracker.link().name().to_owned();
     watch.tracker.stop();
     let observed = watch.drain();
-    watch.laser_box.drain(false);
+    let t_end = host_now();
+    watch.laser_box.drain(false, t_end);
+    let box_lost = watch.laser_box.box_lost(t_end);
     let lasers_not_dark =
         (!down.lasers_dark).then(|| watch.laser_box.trouble().unwrap_or(NO_ACKNOWLEDGEMENT).to_owned());
     watch.tracker_watch.judge(&watch.tracker, host_now());
@@ -92,7 +94,7 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
         tracker_records_lost: recorded.as_ref().map_or(0, |status| status.chunks_lost + status.decisions_lost),
         clipped_share_max: tally.clipped_share_max,
         unreachable_share_max: tally.unreachable_share_max,
-        lasers: LaserSummary { lit_in_part: down.counts.lit_in_part, ..tally.lasers.finish() },
+        lasers: LaserSummary { lit_in_part: down.counts.lit_in_part, box_lost, ..tally.lasers.finish() },
         lasers_dark_at_end: down.lasers_dark,
         lasers_not_dark,
         flat_at_end: down.flat_presented,

@@ -328,7 +328,7 @@ impl Watch<'_> {
         if let Some(warning) = self.panel.judge_rate(output.refresh_hz, now) {
             tracing::warn!("{warning}");
         }
-        self.laser_box.drain(output.armed);
+        self.laser_box.drain(output.armed, now);
         self.desk.tidy();
         self.observer.tick()
     }
@@ -387,18 +387,12 @@ impl Watch<'_> {
         let snapshot = self.snapshot(output, now);
         self.status.write(&snapshot, now);
         self.observer.snapshot(&snapshot);
-        let figures = &snapshot.figures;
+        let counters = self.tracker.counters();
         tracing::debug!(
-            "{}: {} frames made, {} shown, {:.1?} a second; pupil {:?} mm, {}; {} samples, {} rejected; lasers {}",
-            snapshot.state,
-            figures.frames_made,
-            figures.frames_shown,
-            snapshot.frames_shown_hz,
-            snapshot.pupil_mm,
-            snapshot.pupil_state,
-            self.tracker.counters().of(Counter::Samples),
-            self.tracker.counters().rejected_in_all(),
-            snapshot.lasers
+            "{}; {} samples, {} rejected",
+            snapshot.in_short(),
+            counters.of(Counter::Samples),
+            counters.rejected_in_all()
         );
     }
 

@@ -11,6 +11,7 @@ use super::Check;
 use super::access::{named, serial_ports_of};
 use crate::commands::service_facts::below;
 use crate::commands::unit::names;
+use crate::results::file_name;
 
 /// A process, by its number and name.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -94,10 +95,6 @@ fn ports(rig: &Rig, processes: &[Process], root: &Path) -> Result<String, Vec<St
         (true, true) => Ok("the rig names no serial port that is there".into()),
         (true, false) => Ok(said.join("; ")),
     }
-}
-
-fn file_name(path: &Path) -> String {
-    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// How a program is brought to let a port go.

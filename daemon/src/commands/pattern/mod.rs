@@ -37,7 +37,7 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
     let resolution = rig.resolution();
     let encoder = PanelEncoder::new(&rig.panel, resolution, resolution).map_err(Failure::because(Exit::Config))?;
     let pattern = Pattern::from(kind);
-    let placement = Placement::new(to.place.axis, &to.place.colours());
+    let placement = Placement::new(to.place.axis, &to.place.colour);
     let mut levels = LevelsFrame::new(FrameLayout::new(&rig.panel, resolution));
     let usage = Failure::because(Exit::Usage);
     pattern.draw(&placement, &encoder, &rig.geometry, &mut levels).map_err(&usage)?;

@@ -188,7 +188,7 @@ impl Bench {
             shown.dark = field.dark.or(shown.dark);
         }
         while self.box_events.pop().is_ok() {}
-        self.laser_box.drain(self.control.counts().armed);
+        self.laser_box.drain(self.control.counts().armed, host_now());
         while let Ok(event) = self.panel_events.pop() {
             match event {
                 PanelEvent::Lost { fault, .. } if fault.is_recoverable() => {
@@ -210,7 +210,7 @@ impl Bench {
         self.signals.lasers_go_out();
         let down = self.control.shutdown();
         self.signals.lasers_are_out();
-        self.laser_box.drain(false);
+        self.laser_box.drain(false, host_now());
         if !down.panel_ended {
             tracing::error!("{PANEL_HANGS}");
         }

@@ -258,6 +258,28 @@ pub fn choose<'a>(there: &'a [Monitor], spec: &WindowSpec, panel: &PanelMonitor)
     Ok(monitor)
 }
 
+/// What is wrong where the window is to be on `monitor`, which was chosen before, and the monitors `there` are lit now;
+/// nothing where the same one would be chosen again, in the same place.
+pub(super) fn fault_of(
+    monitor: &Monitor,
+    there: &[Monitor],
+    spec: &WindowSpec,
+    panel: &PanelMonitor,
+) -> Option<PanelFault> {
+    if !there.iter().any(|other| other.connector == monitor.connector) {
+        return Some(PanelFault::Unplugged);
+    }
+    match choose(there, spec, panel) {
+        Ok(chosen) if chosen == monitor => None,
+        // It is the same one, but elsewhere on the desktop.
+        Ok(chosen) if chosen.connector == monitor.connector && chosen.edid == monitor.edid => {
+            Some(PanelFault::WindowLost)
+        }
+        Ok(_) => Some(PanelFault::Unplugged),
+        Err(why) => Some(why.as_fault()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -323,6 +345,20 @@ mod tests {
             &["\"LETO\"", "DP-1", "HDMI-1 (\"PLUTO-2\" serial \"SN 0042\") 1920x1080 at 59.94 Hz"],
         );
         refused(&[], &by("LETO"), &["no lit monitor"]);
+    }
+
+    #[test]
+    fn a_panel_that_is_moved_changed_or_gone_is_a_fault_and_one_that_stays_is_none() {
+        let spec = by("HDMI-1");
+        let panel = desk().remove(1);
+        let fault = |there: &[Monitor]| fault_of(&panel, there, &spec, &PANEL);
+        assert_eq!(fault(&desk()), None);
+        let with = |changed: Monitor| [desk().remove(0), changed];
+        assert_eq!(fault(&with(Monitor { left_px: 0, ..panel.clone() })), Some(PanelFault::WindowLost));
+        assert_eq!(fault(&with(Monitor { edid: None, ..panel.clone() })), Some(PanelFault::Unplugged), "another one");
+        assert_eq!(fault(&desk()[..1]), Some(PanelFault::Unplugged));
+        assert_eq!(fault(&with(Monitor { primary: true, ..panel.clone() })), Some(PanelFault::Primary));
+        assert_eq!(fault(&with(Monitor { refresh_hz: Some(50.0), ..panel.clone() })), Some(PanelFault::ModeRefused));
     }
 
     #[test]

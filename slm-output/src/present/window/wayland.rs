@@ -26,7 +26,7 @@ use wayland_protocols::wp::presentation_time::client::wp_presentation_feedback::
 use wayland_protocols::xdg::shell::client::{xdg_surface, xdg_toplevel, xdg_wm_base};
 use wayland_protocols::xdg::xdg_output::zv1::client::{zxdg_output_manager_v1, zxdg_output_v1};
 
-use super::monitors::{Alteration, Monitor, choose};
+use super::monitors::{Alteration, Monitor, choose, fault_of};
 use super::watch::{Completion, Shown, Watched, Watcher};
 use super::{Draw, Opened, Wanted, WindowError};
 use crate::packing::PIXEL_BYTES;
@@ -393,17 +393,9 @@ impl View {
 
     /// What keeps the window from being all of `monitor`'s picture, if anything does.
     fn fault(&mut self, monitor: &Monitor, wanted: &Wanted) -> Option<PanelFault> {
-        let monitors = self.monitors();
-        if !monitors.iter().any(|there| there.connector == monitor.connector) {
-            return Some(PanelFault::Unplugged);
-        }
-        match choose(&monitors, &wanted.spec, &wanted.panel) {
-            Ok(there) if there == monitor => {}
-            Ok(there) if there.connector == monitor.connector && there.edid == monitor.edid => {
-                return Some(PanelFault::WindowLost);
-            }
-            Ok(_) => return Some(PanelFault::Unplugged),
-            Err(why) => return Some(why.as_fault()),
+        let fault = fault_of(monitor, &self.monitors(), &wanted.spec, &wanted.panel);
+        if fault.is_some() {
+            return fault;
         }
         let is_there = self.is_on(monitor) && self.is_fullscreen(monitor);
         // It gets there with its first picture.

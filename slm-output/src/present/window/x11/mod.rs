@@ -28,7 +28,7 @@ use x11rb::protocol::xproto::{
 use x11rb::rust_connection::RustConnection;
 use x11rb::wrapper::ConnectionExt as _;
 
-use super::monitors::{Alteration, Monitor, choose};
+use super::monitors::{Alteration, Monitor, choose, fault_of};
 use super::watch::{Completion, Shown, Watched, Watcher};
 use super::{Draw, Opened, Road, Wanted, WindowError};
 use crate::present::PanelFault;
@@ -315,18 +315,9 @@ impl View {
     /// What keeps the window from being all of `monitor`'s picture, if anything does.
     fn fault(&mut self, monitor: &Monitor, wanted: &Wanted) -> Result<Option<PanelFault>, X11Error> {
         self.stale = false;
-        let monitors = self.monitors()?;
-        if !monitors.iter().any(|there| there.connector == monitor.connector) {
-            return Ok(Some(PanelFault::Unplugged));
-        }
-        match choose(&monitors, &wanted.spec, &wanted.panel) {
-            Ok(there) if there == monitor => {}
-            // It is the same one, but elsewhere on the desktop.
-            Ok(there) if there.connector == monitor.connector && there.edid == monitor.edid => {
-                return Ok(Some(PanelFault::WindowLost));
-            }
-            Ok(_) => return Ok(Some(PanelFault::Unplugged)),
-            Err(why) => return Ok(Some(why.as_fault())),
+        let fault = fault_of(monitor, &self.monitors()?, &wanted.spec, &wanted.panel);
+        if fault.is_some() {
+            return Ok(fault);
         }
         if self.destroyed {
             return Ok(Some(PanelFault::WindowLost));
