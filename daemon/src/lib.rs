@@ -17,7 +17,7 @@ mod frame_state;
 mod local_socket;
 pub mod logging;
 mod machine;
-pub mod made_with;
+mod made_with;
 mod memory;
 mod observer;
 mod overwriting;

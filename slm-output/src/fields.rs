@@ -76,7 +76,7 @@ impl FrameLayout {
     ///
     /// # Panics
     /// Where the order lacks the colour, which the rig file's validation excludes.
-    pub fn position_of(&self, colour: Colour) -> usize {
+    fn position_of(&self, colour: Colour) -> usize {
         self.field_order.iter().position(|&shown| shown == colour).expect("a field order holds each colour once")
     }
 

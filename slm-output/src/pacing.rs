@@ -214,7 +214,7 @@ impl Pacer {
     }
 
     /// Time that is planned for a frame from waking to its refresh.
-    pub fn budget(&self) -> TimeNs {
+    fn budget(&self) -> TimeNs {
         self.frame_times.estimate + self.lead
     }
 }

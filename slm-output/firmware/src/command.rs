@@ -194,7 +194,7 @@ impl Refusal {
     }
 
     /// The refusal of a code; an unknown code is one that we do not understand.
-    pub fn from_code(code: &str) -> Self {
+    fn from_code(code: &str) -> Self {
         Self::CODES.into_iter().find(|(_, known, _)| *known == code).map_or(Self::Malformed, |(refusal, ..)| refusal)
     }
 }

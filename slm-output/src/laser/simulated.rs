@@ -51,7 +51,8 @@ impl SimulatedLaser {
     }
 
     /// Events that were lost because nobody fetched them.
-    pub fn events_lost(&self) -> u64 {
+    #[cfg(test)]
+    fn events_lost(&self) -> u64 {
         self.events_lost
     }
 

@@ -59,7 +59,7 @@ pub enum Finding {
 
 impl Finding {
     /// Whether light went where it must not; otherwise some was only missing.
-    pub fn is_unsafe(&self) -> bool {
+    fn is_unsafe(&self) -> bool {
         !matches!(self, Self::FieldWithoutWindow { .. })
     }
 }
