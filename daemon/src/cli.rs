@@ -32,7 +32,7 @@ pub struct Cli {
     pub run: RunArgs,
 }
 
-/// The subcommands.
+/// What holod does, where it is not `run`.
 #[derive(Subcommand, Debug)]
 pub enum Command {
     /// Drive the display until told to stop.
@@ -96,7 +96,7 @@ pub struct LutArgs {
     /// Overwrite what is there already.
     #[arg(long)]
     pub force: bool,
-    /// The rig, whose panel has so many levels, with phases that rise or fall (phase_sign).
+    /// The rig: the panel's number of levels, and whether phases rise or fall (phase_sign).
     #[command(flatten)]
     pub rig: RigArgs,
     /// Print what the table says as JSON.
@@ -118,7 +118,7 @@ pub enum LaserCommand {
 /// Which lasers are put out, and when.
 #[derive(Args, Debug, Clone)]
 pub struct DarkArgs {
-    /// Where they are.
+    /// The box or the lasers, by rig file or port.
     #[command(flatten)]
     pub lasers: LaserArgs,
     /// For the service's `ExecStopPost=`: leave them alone after a start that failed before it opened them, since another
@@ -130,7 +130,7 @@ pub struct DarkArgs {
 /// Where the laser box is.
 #[derive(Args, Debug, Clone)]
 pub struct LaserArgs {
-    /// The rig.
+    /// The bench whose lasers are meant.
     #[command(flatten)]
     pub rig: RigArgs,
     /// The serial port of a box that speaks holod's laser protocol, in place of a rig file.
@@ -270,13 +270,13 @@ impl Backend {
     }
 }
 
-/// Options of `run`.
+/// Options of `run`, and of `holod` without a subcommand.
 #[derive(Args, Debug, Clone, Default)]
 pub struct RunArgs {
-    /// The rig.
+    /// The bench that is run; the built-in one without a file.
     #[command(flatten)]
     pub rig: RigArgs,
-    /// The network.
+    /// Weights in place of those that the rig names.
     #[command(flatten)]
     pub network: NetworkArgs,
     /// The eye tracker's spec.
@@ -288,10 +288,10 @@ pub struct RunArgs {
                 replay:FILE[,speed=X|max][,loop], a log or report FILE, or mock[:SCENARIO or FILE]; `holod tracker list` names profiles"
     )]
     pub tracker: Option<String>,
-    /// The scene.
+    /// What is shown: files, a live feed, or the built-in scene.
     #[command(flatten)]
     pub scene: SceneArgs,
-    /// With --scene feed: put the lasers out when no new picture has come for so many seconds, until one comes; the
+    /// With --scene feed: put the lasers out when no new picture has come for this many seconds, until one comes; the
     /// last picture stays lit when left out.
     #[arg(long, value_name = "SECONDS", value_parser = parse_silence)]
     pub feed_dark_after: Option<Duration>,
@@ -338,7 +338,7 @@ pub struct RunArgs {
     /// Overwrite an earlier record; it goes once the first frame is made.
     #[arg(long, requires = "record")]
     pub force: bool,
-    /// The status page.
+    /// Where the status page is served, and to whom.
     #[command(flatten)]
     pub page: PageArgs,
     /// Print the summary as JSON.
@@ -368,7 +368,7 @@ pub struct PageArgs {
 /// Options of `demo`.
 #[derive(Args, Debug, Clone)]
 pub struct DemoArgs {
-    /// The network.
+    /// Weights in place of those of the built-in bench.
     #[command(flatten)]
     pub network: NetworkArgs,
     /// Size of the hologram in panel pixels; when left out 512x512, or what a smaller panel has.
@@ -388,13 +388,13 @@ pub struct DemoArgs {
 /// Options of `render`.
 #[derive(Args, Debug, Clone)]
 pub struct RenderArgs {
-    /// The rig.
+    /// The bench that the hologram is made for.
     #[command(flatten)]
     pub rig: RigArgs,
-    /// The network.
+    /// Weights in place of those that the rig names.
     #[command(flatten)]
     pub network: NetworkArgs,
-    /// The scene.
+    /// The picture that the hologram is made of.
     #[command(flatten)]
     pub scene: SceneArgs,
     /// A directory with a stack.toml, in place of a scene: images of one scene that are focused at several depths, seen
@@ -422,17 +422,17 @@ pub struct RenderArgs {
 /// Options of `view`.
 #[derive(Args, Debug, Clone)]
 pub struct ViewArgs {
-    /// The rig.
+    /// The bench through which the eye looks.
     #[command(flatten)]
     pub rig: RigArgs,
-    /// The network.
+    /// Weights in place of those that the rig names.
     #[command(flatten)]
     pub network: NetworkArgs,
     /// A directory that `holod render` wrote, with the rig for which it did so; without a rig the panel is the built-in
     /// bench's, and pitch, wavelengths and eyepiece are those of the hologram.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "pupil", "weights", "resolution", "fit", "depth_encoding", "backend"])]
     pub hologram: Option<PathBuf>,
-    /// The scene.
+    /// The picture that a hologram is made of and that is looked at.
     #[command(flatten)]
     pub scene: SceneArgs,
     /// Pupil diameter for which the hologram is made, in millimetres.
@@ -461,10 +461,10 @@ pub struct ViewArgs {
 /// Options of `check`.
 #[derive(Args, Debug, Clone)]
 pub struct CheckArgs {
-    /// The rig.
+    /// The bench that is checked.
     #[command(flatten)]
     pub rig: RigArgs,
-    /// The network.
+    /// Weights in place of those that the rig names.
     #[command(flatten)]
     pub network: NetworkArgs,
     /// Eye tracker's spec, as `run` takes it; the rig's own when left out.
@@ -503,10 +503,10 @@ pub struct UnitArgs {
 /// Options of `bench`.
 #[derive(Args, Debug, Clone)]
 pub struct BenchArgs {
-    /// The rig.
+    /// The bench for whose panel and network times are measured.
     #[command(flatten)]
     pub rig: RigArgs,
-    /// The network.
+    /// Weights in place of those that the rig names.
     #[command(flatten)]
     pub network: NetworkArgs,
     /// Engine for the network.
@@ -582,7 +582,7 @@ pub struct CtlArgs {
     /// Its control socket, in place of the one that it wrote into its status.
     #[arg(long, value_name = "SOCKET", global = true, conflicts_with = "pid")]
     pub socket: Option<PathBuf>,
-    /// What to do.
+    /// What is to change, or what is asked.
     #[command(subcommand)]
     pub order: CtlOrder,
 }
@@ -648,9 +648,9 @@ pub enum CtlOrder {
 /// The pupil that holograms are computed for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum PupilOrder {
-    /// The tracker's.
+    /// The pupil that the tracker makes of its samples.
     Follow,
-    /// This one.
+    /// This diameter, whatever the tracker says.
     Fixed(PupilDiameter),
 }
 
@@ -720,7 +720,7 @@ pub struct TryArgs {
     /// The tracker, as after `--tracker`; the rig's own when left out.
     #[arg(value_name = "SPEC")]
     pub spec: Option<String>,
-    /// The rig.
+    /// The bench whose tracker is tried out.
     #[command(flatten)]
     pub rig: RigArgs,
     /// How long it is read, for example 10s or 2m.

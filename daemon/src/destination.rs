@@ -16,7 +16,7 @@ use crate::staging::{Temporary, folder_of};
 pub(crate) enum Destination {
     /// A file that is written beside its place and renamed.
     File(PathBuf),
-    /// The standard output.
+    /// Standard output, named by `-`.
     Stdout,
 }
 

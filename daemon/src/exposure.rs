@@ -42,7 +42,7 @@ pub struct PatternOnPanel<'a> {
 
 /// What happened on a rig.
 pub struct Exposure<'a> {
-    /// The rig.
+    /// The rig whose panel and lasers these were.
     pub rig: &'a Rig,
     /// The encoder that made the levels.
     pub encoder: &'a PanelEncoder,

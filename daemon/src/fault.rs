@@ -25,7 +25,7 @@ enum Fault {
     Stall(&'static str),
     /// The frame thread takes memory until there is none.
     Memory,
-    /// The clock that all threads read is set by so many nanoseconds.
+    /// The clock that all threads read is set by this many nanoseconds, ahead where they are positive.
     Clock(i64),
     /// The panel reports no refresh any more.
     NoReports,

@@ -137,11 +137,11 @@ pub fn filter(asked: Option<&str>) -> (EnvFilter, Option<String>) {
 /// A line of the log.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Line {
-    /// Milliseconds since 1970.
+    /// Milliseconds since 1970, UTC, when it was said.
     pub unix_ms: u64,
     /// `INFO`, `WARN` or `ERROR`.
     pub level: &'static str,
-    /// What it says.
+    /// The message, without time and level.
     pub text: String,
 }
 
@@ -264,7 +264,7 @@ impl Drop for LogFile {
     }
 }
 
-/// Writes panics down, too, before whoever else hears of them.
+/// Writes panics down, too, before anything else is done about them.
 fn keep_panics() {
     static KEPT: Once = Once::new();
     KEPT.call_once(|| {

@@ -23,7 +23,7 @@ pub struct Machine {
     pub cpu: String,
     /// Cores that holod may use.
     pub cores: usize,
-    /// Memory, MiB.
+    /// Memory of the machine, MiB; 0 where the kernel does not tell.
     pub memory_mib: u64,
     /// Graphics cards: vendor and device on PCI, driver, and a name where the driver tells one.
     pub gpus: Vec<String>,
@@ -35,7 +35,7 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// This one.
+    /// The machine that holod runs on.
     pub fn this() -> Self {
         Self::below(Path::new("/"))
     }

@@ -17,7 +17,7 @@ pub struct MadeWith {
     pub weights: String,
     /// XXH3 of 64 bits of the weights' file as it was loaded, hexadecimal; none of built-in ones.
     pub weights_xxh3: Option<String>,
-    /// The rig's name.
+    /// The rig's name, as its file gives it.
     pub rig: String,
     /// Of the rig file's text, as `holod check` states it; none of the built-in rig.
     pub rig_hash: Option<String>,

@@ -1,4 +1,4 @@
-//! Those who hear of everything in a run.
+//! Who is told what happens in a run: the record, the page, a comparison with a report.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use crate::failure::Failure;
 use crate::frame_record::FrameRecord;
 use crate::snapshot::Snapshot;
 
-/// Hears of everything in the run, on the control thread.
+/// Is told of everything in the run, on the control thread, in the order in which it happened there.
 pub trait Observer {
     /// Whether it wants to look at what the panel shows, which costs memory for three frames.
     fn wants_look(&self) -> bool {
@@ -51,7 +51,7 @@ pub trait Observer {
 pub struct Began {
     /// When its time began.
     pub t_origin: TimeNs,
-    /// The bench.
+    /// The bench that is run, with what options changed of its file.
     pub rig: Rig,
     /// Turns levels back into phase.
     pub encoder: Arc<PanelEncoder>,

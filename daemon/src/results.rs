@@ -62,7 +62,7 @@ pub fn save_png(picture: impl Into<DynamicImage>, path: &Path) -> Result<(), Fai
     save(bytes.get_ref(), path)
 }
 
-/// Saves text.
+/// Saves text as it is.
 pub fn save_text(text: &str, path: &Path) -> Result<(), Failure> {
     save(text.as_bytes(), path)
 }

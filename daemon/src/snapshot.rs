@@ -129,7 +129,7 @@ impl Snapshot {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum RecordCondition {
-    /// It is written.
+    /// It goes on, though rows may be left out.
     #[default]
     Written,
     /// It was given up.

@@ -174,7 +174,7 @@ impl Drop for StatusFile {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Found {
     pub pid: u32,
-    /// Its control socket.
+    /// Its control socket, where it has one.
     pub control: Option<PathBuf>,
     /// Nothing where it cannot be understood, as it may not be of another version.
     pub status: Option<Snapshot>,

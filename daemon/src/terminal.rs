@@ -34,9 +34,9 @@ pub(crate) struct Axes<'a> {
 /// Columns and rows of a plot.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct TextSize {
-    /// Columns.
+    /// Columns, in characters of the terminal.
     pub width: u16,
-    /// Rows.
+    /// Rows, in lines of the terminal.
     pub height: u16,
 }
 

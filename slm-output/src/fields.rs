@@ -12,7 +12,7 @@ pub const FIELDS: usize = 3;
 /// How a panel wants the levels of a colour frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameLayout {
-    /// Panel pixels.
+    /// Pixels of one field: those of the panel.
     pub resolution: Resolution,
     /// How the fields are carried.
     pub mode: PanelMode,
@@ -276,7 +276,7 @@ pub struct ColourField {
     pub frame_id: u64,
     /// The laser that belongs to it.
     pub colour: Colour,
-    /// Panel pixels.
+    /// Width and height of `levels`: the panel's pixels.
     pub resolution: Resolution,
     /// Levels `[height, width]`, row-major.
     pub levels: Vec<u16>,
@@ -325,7 +325,7 @@ pub struct FieldMut<'a> {
 }
 
 impl FieldMut<'_> {
-    /// Panel pixels.
+    /// Width and height of the field: the panel's pixels.
     pub fn resolution(&self) -> Resolution {
         self.resolution
     }

@@ -58,7 +58,7 @@ pub struct PacingConfig {
 pub struct FramePlan {
     /// Its number, counting up from 1.
     pub frame_id: u64,
-    /// When to begin.
+    /// Host time at which its making is to begin.
     pub t_wake: TimeNs,
     /// The refresh that it is for.
     pub t_desired_present: TimeNs,

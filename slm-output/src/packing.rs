@@ -112,7 +112,8 @@ fn pack(layout: &FrameLayout, samples: &[u16], format: PixelFormat, pixels: &mut
     }
 }
 
-/// Red, green and blue stand this many bits up in a little-endian word, each of so many bits; the bits above are 1.
+/// Where red, green and blue begin in a little-endian word, in bits from the lowest, and how many bits each has; the
+/// bits above are 1.
 #[inline(always)]
 fn pack_as<const RED: u32, const GREEN: u32, const BLUE: u32, const BITS: u32>(
     layout: &FrameLayout,

@@ -61,7 +61,7 @@ pub enum Pattern {
         /// The squares' difference of phase in radians; π leaves no light in the zero order.
         depth_rad: f64,
     },
-    /// Parallel lines.
+    /// Parallel lines, which send the light to one side.
     Grating {
         /// Pixels across one line.
         period_px: f64,
@@ -111,9 +111,9 @@ pub enum Pattern {
 pub enum Profile {
     /// Half at one phase, half at the other.
     Binary,
-    /// Rising evenly.
+    /// A ramp from 0 to the depth across each line.
     Blazed,
-    /// A sine.
+    /// A sine, its crests `depth_rad` above its troughs.
     Sinusoidal,
 }
 
@@ -600,7 +600,7 @@ fn direction(angle_deg: f64) -> [f64; 2] {
     [cosine, sine].map(|along| if along.abs() < 1e-12 { 0.0 } else { along })
 }
 
-/// The place of the middle of so many pixels in a row.
+/// The place of the middle of a row of this many pixels.
 fn middle(pixels: usize) -> f64 {
     0.5 * (pixels as f64 - 1.0)
 }

@@ -640,7 +640,7 @@ fn a_box_that_is_made_dark_in_the_dark_is_lit_again_only_by_a_host_that_begins()
             host.program(&host_program(), host_now()).unwrap();
         } else {
             // Whatever answer the other program took, the box is asked again.
-            eventually("the host to hear of it", || {
+            eventually("the host to be told", || {
                 let _missed = host.poll(host_now(), &mut |_| ());
                 std::thread::sleep(Duration::from_millis(5));
                 host.is_made_dark()

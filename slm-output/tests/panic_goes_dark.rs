@@ -50,7 +50,7 @@ fn a_panic_in_any_thread_goes_dark_for_good() {
     assert!(!switch.is_dark() && switch.reason().is_none(), "a panic that is caught changes nothing");
     let panicked = std::thread::spawn(|| panic!("meant"));
     while switch.reason().is_none() {
-        assert!(host_now() < t_end, "nobody hears of it");
+        assert!(host_now() < t_end, "nobody is told");
         std::thread::sleep(Duration::from_millis(1));
     }
     switch.wait_for_panic_message(host_now);

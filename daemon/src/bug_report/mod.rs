@@ -71,10 +71,10 @@ pub struct Manifest {
     pub left_out: Vec<String>,
 }
 
-/// Kinds of report.
+/// The layout of a report, by its name in the manifest.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Format {
-    /// The first.
+    /// A gzipped tar archive with the manifest `report.json`.
     #[serde(rename = "holod-report-1")]
     First,
 }
@@ -102,7 +102,7 @@ fn unix_ms() -> u64 {
 pub struct Packed {
     /// Its name within the report.
     pub name: String,
-    /// Its length.
+    /// Its length in bytes, uncompressed.
     pub bytes: u64,
     /// XXH3 of 64 bits of its content, hexadecimal.
     pub xxh3: String,

@@ -174,10 +174,10 @@ pub struct PatternPlace {
 /// Where a pattern goes.
 #[derive(Args, Debug, Clone)]
 pub struct PatternTarget {
-    /// The rig.
+    /// The bench whose panel shows it.
     #[command(flatten)]
     pub rig: RigArgs,
-    /// On the panel.
+    /// Its axis, and the colours that have it.
     #[command(flatten)]
     pub place: PatternPlace,
     /// PNG of what travels to the panel; where the fields travel one after another, one for each (FILE-1-red.png and

@@ -104,7 +104,7 @@ struct FeedReport {
     resolution: String,
     picture_mb: f64,
     pictures: usize,
-    /// Programs that ran or waited to run in the minute before, on so many cores.
+    /// Programs that ran or waited to run, mean over the minute before; to be compared with `cores`.
     load: Option<f64>,
     cores: usize,
     memcpy: Quartiles,

@@ -59,7 +59,7 @@ pub enum Request {
     },
     /// Show the picture that is shown until further notice; the pupil is followed.
     Pause {},
-    /// Take that back.
+    /// End a pause: show what the scene or the feed has now.
     Resume {},
     /// Compute for one pupil, whatever the tracker says.
     Pupil {
@@ -67,7 +67,7 @@ pub enum Request {
         #[serde(default)]
         mm: Option<f32>,
     },
-    /// Follow another eye.
+    /// Follow another eye, as `tracker.eye` of a rig file names it.
     Eye { eye: Eye },
     /// Read the rig file again, and go on with what it says now.
     Reload {
@@ -87,7 +87,7 @@ pub enum Request {
     },
     /// Show one phase everywhere in place of holograms.
     Flat {},
-    /// Show holograms again.
+    /// Show holograms in place of a pattern.
     Hologram {},
     /// Keep the lasers dark.
     LasersDark {},
@@ -129,7 +129,7 @@ impl Request {
     }
 }
 
-/// An answer.
+/// An answer on the control socket, one line of JSON.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(into = "AnswerLine", try_from = "AnswerLine")]
 pub enum Answer {

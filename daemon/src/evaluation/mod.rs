@@ -88,7 +88,7 @@ pub struct Refocus {
 
 /// The light of one scene of bright marks on exact black for one pupil, which the hologram is made for and which looks.
 pub struct MarksLight {
-    /// What is bright.
+    /// Which marks are bright: dots, lines or stars.
     pub marks: Marks,
     /// All light that is seen over what was put in.
     pub light_ratio: f64,

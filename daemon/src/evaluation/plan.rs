@@ -34,7 +34,7 @@ pub struct EvaluationSettings<'a> {
     pub marks: Option<&'a Path>,
     /// Pupils to judge, among those of the scenes; all of these where there are none.
     pub pupils: &'a [PupilDiameter],
-    /// Judge only so many scenes.
+    /// Judge no more scenes than this.
     pub limit: Option<usize>,
     /// Pixels at each edge that are not judged.
     pub border_px: usize,
@@ -54,7 +54,7 @@ pub struct EvaluationPlan<'a> {
 
 /// The figures, and pictures to look at.
 pub struct Evaluated {
-    /// The figures.
+    /// Every figure, as `holod evaluate --json` writes it.
     pub evaluation: Evaluation,
     /// The pupils that were judged.
     pub pupils: Vec<PupilDiameter>,
@@ -68,7 +68,7 @@ pub struct Evaluated {
 
 /// What is seen of one scene of marks.
 pub struct MarksViews {
-    /// What is bright.
+    /// Which marks are bright: dots, lines or stars.
     pub marks: Marks,
     /// One for each pupil.
     pub views: Vec<EndViews>,
@@ -76,7 +76,7 @@ pub struct MarksViews {
 
 /// What is seen of one scene.
 pub struct SceneViews {
-    /// The scene's number.
+    /// The scene's number in its set.
     pub index: u64,
     /// One for each pupil.
     pub views: Vec<EndViews>,
@@ -94,7 +94,7 @@ pub struct Evaluation {
     pub colours: Vec<Colour>,
     /// How many scenes were judged.
     pub scenes: usize,
-    /// Which they were.
+    /// The ordinary scenes that were judged, by set.
     pub scene_sets: Vec<SceneSet>,
     /// Which cards were judged.
     pub card_sets: Vec<SceneSet>,
@@ -102,7 +102,7 @@ pub struct Evaluation {
     pub mark_sets: Vec<SceneSet>,
     /// Width of the scenes.
     pub width_px: usize,
-    /// Their height.
+    /// Height of the scenes.
     pub height_px: usize,
     /// Where their stacks are focused.
     pub focus_dpt: Vec<f64>,
@@ -129,7 +129,7 @@ pub struct Evaluation {
 pub struct SceneSet {
     /// `test`, `cards` or `marks`.
     pub kind: String,
-    /// The seed.
+    /// The seed that all scenes of the set were generated from.
     pub seed: u64,
     /// The scenes' numbers, in the order in which they were judged.
     pub indices: Vec<u64>,
@@ -138,15 +138,15 @@ pub struct SceneSet {
 /// One contrast of cards and one pupil, which the hologram is made for and which looks: means over scenes.
 #[derive(Debug, PartialEq, Serialize)]
 pub struct RefocusRow {
-    /// [`Refocus::contrast`].
+    /// `dark on bright` or `bright on dark` ([`Refocus::contrast`]).
     pub contrast: &'static str,
-    /// The pupil.
+    /// The pupil that the hologram is made for and seen with.
     pub pupil_mm: f32,
     /// How many scenes there are of this contrast.
     pub scenes: usize,
-    /// [`Refocus::near_card`].
+    /// Gradient energy of the near card in focus over that out of focus ([`Refocus::near_card`]).
     pub near_card: f64,
-    /// [`Refocus::far_card`].
+    /// The same of the far card ([`Refocus::far_card`]).
     pub far_card: f64,
 }
 
@@ -155,13 +155,13 @@ pub struct RefocusRow {
 pub struct MarksRow {
     /// `dots`, `lines` or `stars`.
     pub marks: &'static str,
-    /// The pupil.
+    /// The pupil that the hologram is made for and seen with.
     pub pupil_mm: f32,
     /// How many scenes there are of this kind.
     pub scenes: usize,
-    /// [`MarksLight::light_ratio`].
+    /// All light that is seen over what was put in: 1 is right ([`MarksLight::light_ratio`]).
     pub light_ratio: f64,
-    /// [`MarksLight::dark_mean`].
+    /// Mean light of what is black, white = 1: 0 is right ([`MarksLight::dark_mean`]).
     pub dark_mean: f64,
 }
 
@@ -169,23 +169,23 @@ pub struct MarksRow {
 /// the figures are.
 #[derive(Serialize)]
 pub struct Row {
-    /// The pupil.
+    /// The pupil that the hologram is made for and seen with.
     pub pupil_mm: f32,
-    /// [`StackScore::psnr_db`].
+    /// PSNR over all planes ([`StackScore::psnr_db`]).
     pub psnr_db: Option<Estimate>,
-    /// [`StackScore::in_focus_psnr_db`].
+    /// PSNR where the target is sharp ([`StackScore::in_focus_psnr_db`]).
     pub psnr_in_focus_db: Option<Estimate>,
-    /// [`StackScore::out_of_focus_psnr_db`].
+    /// PSNR where the target is blurred ([`StackScore::out_of_focus_psnr_db`]).
     pub psnr_out_of_focus_db: Option<Estimate>,
-    /// [`StackScore::focus_slope`].
+    /// How much of the target's refocus there is: 1 is all ([`StackScore::focus_slope`]).
     pub slope: Option<Estimate>,
-    /// [`StackScore::focus_correlation`].
+    /// How well its refocus goes with the target's: 1 at best ([`StackScore::focus_correlation`]).
     pub correlation: Option<Estimate>,
-    /// [`StackScore::ssim`].
+    /// Structural similarity, mean over planes: 1 at best ([`StackScore::ssim`]).
     pub ssim: Option<Estimate>,
-    /// [`StackScore::foam`].
+    /// Energy of structure in the blur that the target has not, white = 1 ([`StackScore::foam`]).
     pub foam: Option<Estimate>,
-    /// [`StackScore::flat_oracle_psnr_db`].
+    /// PSNR of the target's mean at every plane ([`StackScore::flat_oracle_psnr_db`]).
     pub flat_oracle_psnr_db: Option<Estimate>,
     /// Share of amplitudes above the double phase's constant, 0..=1.
     pub clipped_share: Option<Estimate>,
@@ -198,7 +198,7 @@ pub struct Matrix {
     pub given_pupil_mm: Vec<f32>,
     /// The pupils of the columns.
     pub judged_pupil_mm: Vec<f32>,
-    /// Row by row.
+    /// One row for each pupil of `given_pupil_mm`, one figure in it for each of `judged_pupil_mm`.
     pub psnr_db: Vec<Vec<f64>>,
 }
 
@@ -226,7 +226,7 @@ impl<'a> EvaluationPlan<'a> {
         Ok(Self { settings, made_with, colours, weights, shards, cards, marks, pupils })
     }
 
-    /// How often [`Self::judge`] tells of a step.
+    /// How often [`Self::judge`] reports a step.
     pub fn steps(&self) -> usize {
         self.shards.len() + self.cards.len() + self.marks.len()
     }

@@ -8,7 +8,7 @@ use serde::Serialize;
 /// and the figure for normally distributed among them.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Estimate {
-    /// The mean.
+    /// The mean over scenes, in the unit of the figure.
     pub mean: f64,
     /// Half of the interval's width; nothing for fewer than two scenes.
     pub ci95_half_width: Option<f64>,

@@ -28,7 +28,7 @@ pub(super) struct Outlet {
 struct Shared {
     lines: Queue<Vec<u8>>,
     /// Of which nothing is written yet.
-    untold: AtomicU64,
+    left_out: AtomicU64,
     lost: AtomicU64,
     first_error: Mutex<Option<io::Error>>,
 }
@@ -41,7 +41,7 @@ impl Outlet {
     pub(super) fn start(name: &str, out: impl Write + Send + 'static) -> io::Result<Self> {
         let shared = Arc::new(Shared {
             lines: Queue::default(),
-            untold: AtomicU64::new(0),
+            left_out: AtomicU64::new(0),
             lost: AtomicU64::new(0),
             first_error: Mutex::new(None),
         });
@@ -81,7 +81,7 @@ impl Drop for Outlet {
 
 impl Shared {
     fn lose(&self, lines: u64) {
-        self.untold.fetch_add(lines, Ordering::Relaxed);
+        self.left_out.fetch_add(lines, Ordering::Relaxed);
         self.lost.fetch_add(lines, Ordering::Relaxed);
     }
 
@@ -100,13 +100,13 @@ impl Shared {
     }
 
     fn tell_lost(&self, out: &mut impl Write) -> io::Result<()> {
-        let untold = self.untold.load(Ordering::Relaxed);
-        if untold == 0 {
+        let left_out = self.left_out.load(Ordering::Relaxed);
+        if left_out == 0 {
             return Ok(());
         }
-        let text = format!("{untold} lines of the log were left out: what reads or stores it took no more");
+        let text = format!("{left_out} lines of the log were left out: what reads or stores it took no more");
         write_patiently(out, &Line::now(Level::WARN, text).to_bytes())?;
-        self.untold.fetch_sub(untold, Ordering::Relaxed);
+        self.left_out.fetch_sub(left_out, Ordering::Relaxed);
         Ok(())
     }
 }

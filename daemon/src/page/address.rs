@@ -8,7 +8,7 @@ use std::str::FromStr;
 /// Where the page is served: a port of this machine, an address and port, or a Unix socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PageAddress {
-    /// TCP.
+    /// An address and a port for TCP.
     Tcp(SocketAddr),
     /// A Unix socket, which this user and the group may open.
     Unix(PathBuf),

@@ -66,7 +66,7 @@ impl Token {
 
 /// What is asked of everybody who comes.
 pub(super) enum Door {
-    /// The token.
+    /// That it shows the token, in a header, a cookie or the address.
     Token(Token),
     /// That the browser asked for this machine by one of its own names: a page from elsewhere whose name was made to
     /// lead here has another.
@@ -93,11 +93,11 @@ pub(super) struct Doorkeeper {
 
 /// What a door says to whoever comes.
 pub(super) enum Admission {
-    /// Come in.
+    /// The request is answered.
     In,
     /// Come in by the cookie that this answer sets.
     ByCookie(Response),
-    /// Stay out.
+    /// This answer takes the place of what was asked for.
     Refused(Response),
 }
 

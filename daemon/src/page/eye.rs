@@ -194,7 +194,7 @@ impl EyeThread {
         Ok(seen)
     }
 
-    /// What a frame was made with, which the control thread may hear of later than the panel.
+    /// What a frame was made with, which may reach the control thread later than the panel.
     fn made_with(&self, frame: u64) -> Option<Made> {
         let found = || {
             let made = self.made.lock().unwrap_or_else(PoisonError::into_inner);

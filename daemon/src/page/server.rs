@@ -1,4 +1,4 @@
-//! HTTP.
+//! The page's HTTP server: its routes, what each answers, and the event streams.
 
 use std::io;
 use std::net::SocketAddr;
@@ -119,7 +119,7 @@ impl PageServer {
 
 impl Drop for PageServer {
     fn drop(&mut self) {
-        // Streams end with the run; viewers are given the time to hear of it.
+        // Streams end with the run; viewers are given the time to be told.
         let t_end = Instant::now() + FAREWELL;
         while self.live.viewers.load(Ordering::Relaxed) > 0 && Instant::now() < t_end {
             std::thread::sleep(Duration::from_millis(5));

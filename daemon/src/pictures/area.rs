@@ -7,9 +7,9 @@ use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
 /// A rectangle of pixels.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Area {
-    /// Columns.
+    /// Columns from the left, the end left out.
     pub columns: Range<usize>,
-    /// Rows.
+    /// Rows from the top, the end left out.
     pub rows: Range<usize>,
 }
 

@@ -18,13 +18,13 @@ pub struct PupilSampleMark {
     pub accepted: bool,
 }
 
-/// The pupil's trace.
+/// A pupil over time: what was measured and what was made of it.
 pub struct PupilPlot<'a> {
     /// The unit of all figures; millimetres where there is none. Samples in another unit were not judged.
     pub unit: Option<&'static str>,
     /// Of a log, which nothing was shown of: the estimate is at its samples' own times.
     pub of_log: bool,
-    /// Every raw sample.
+    /// Every sample, refused ones included.
     pub samples: &'a [PupilSampleMark],
     /// (seconds, millimetres) that each frame was rendered for, or that a log's samples come to.
     pub estimate: &'a [(f64, f64)],

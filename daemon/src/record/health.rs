@@ -62,7 +62,7 @@ impl RecordHealth {
         self.reason().is_some()
     }
 
-    /// How it is.
+    /// How the record is now, for the status.
     pub fn state(&self) -> RecordState {
         let reason = self.reason().clone();
         let state = if reason.is_some() { RecordCondition::Lost } else { RecordCondition::Written };

@@ -115,11 +115,11 @@ pub(crate) fn weights_file(weights: &WeightsChoice) -> Result<Option<SourceFile>
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub(crate) enum SceneSource {
-    /// The built-in scene.
+    /// The scene that holod composes itself.
     BuiltIn,
     /// Pictures of a live feed, which are not kept.
     Feed,
-    /// Files.
+    /// Files, known by their lengths and hashes.
     Files {
         /// How its pictures were brought to the hologram's size.
         fit: Fit,

@@ -42,7 +42,7 @@ use crate::source::{OpenPictures, Pictures};
 use crate::status::{self, StatusFile};
 use crate::{progress, scheduling, setup, source, speed};
 
-/// Lasers go dark when one frame has stayed on the panel for so many frame times, within these limits.
+/// Lasers go dark when one frame has stayed on the panel for this many frame times, within these limits.
 const STALL_FRAMES: i64 = 6;
 const STALL_TIMEOUT_MIN: TimeNs = TimeNs(2_000_000_000);
 const STALL_TIMEOUT_MAX: TimeNs = TimeNs(10_000_000_000);

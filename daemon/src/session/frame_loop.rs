@@ -109,7 +109,7 @@ pub(super) enum Change {
 /// Frame records on their way to the control thread.
 pub(super) const RECORDS: usize = 1024;
 
-/// What the loop tells of one frame.
+/// What the loop says of one frame.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct LoopRecord {
     pub frame: FrameRecord,
@@ -192,7 +192,7 @@ impl FrameLoop {
             levels_xxh3: made.levels_xxh3,
             is_computed: filled.there.is_none(),
         };
-        self.tell(frame, &filled);
+        self.report(frame, &filled);
         self.port.submit(&plan, keep, t_submit);
         match filled.there {
             None => self.pacer.submitted(plan.frame_id, t_submit),
@@ -251,7 +251,7 @@ impl FrameLoop {
     }
 
     /// Hands what is to be said of a frame to the control thread.
-    fn tell(&mut self, frame: FrameRecord, filled: &Filled) {
+    fn report(&mut self, frame: FrameRecord, filled: &Filled) {
         let record = LoopRecord {
             frame,
             t_picture_in_hand: filled.picture.t_came,

@@ -21,7 +21,7 @@ const FARTHEST_PREDICTION: TimeNs = TimeNs(200_000_000);
 pub(super) enum Inputs {
     /// The tracker, and whatever is to be shown.
     Followed(Followed),
-    /// A record.
+    /// The frames of a record, made again.
     Recorded(Playback),
 }
 

@@ -20,7 +20,7 @@ const KEPT_DARK: usize = 10;
 /// What the lasers did in the whole run.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct LaserSummary {
-    /// Fields judged.
+    /// Fields of frames that were judged, repetitions included.
     pub fields: usize,
     /// Of those, lit by exactly one window of their own colour.
     pub lit: usize,

@@ -1,4 +1,4 @@
-//! What a person should hear of the panel and the lasers while the loop runs.
+//! What is said of the panel and the lasers while the loop runs.
 
 use holod_calibration::TimeNs;
 use holod_calibration::rig::{PanelMode, RATE_TOLERANCE, Rig};

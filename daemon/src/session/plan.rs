@@ -1,4 +1,4 @@
-//! What to run.
+//! A run before it begins: bench, network, pictures, tracker, panel, record and limits.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -16,19 +16,19 @@ use crate::control::RigReader;
 use crate::record::RecordHealth;
 use crate::source::Pictures;
 
-/// What to run.
+/// A run before anything of it is opened: the bench, what is shown on it, and when that is over.
 pub struct SessionPlan {
-    /// The bench.
+    /// The bench, with what options change of its file.
     pub rig: Rig,
     /// Reads it again, where there is a file to read it from.
     pub rig_again: Option<RigReader>,
     /// What asks for that; where there is nothing, SIGHUP ends the run.
     pub hangups: Option<Hangups>,
-    /// The network.
+    /// The network that computes the holograms, loaded.
     pub weights: Weights,
     /// Which engine runs it.
     pub backend: Backend,
-    /// What to show.
+    /// The pictures that holograms are made of.
     pub pictures: Pictures,
     /// Where to show it.
     pub output: OutputSpec,
@@ -42,9 +42,9 @@ pub struct SessionPlan {
     pub record_tracker: Option<RecordFiles>,
     /// Whether the run's record goes on.
     pub record: Option<Arc<RecordHealth>>,
-    /// Stop after so many frames.
+    /// Stop once this many frames have been made.
     pub frame_limit: Option<u64>,
-    /// Stop after so long.
+    /// Stop after this time, from the run's beginning on.
     pub duration: Option<Duration>,
     /// Keep the levels that the panel showed, the newest for each half millimetre of pupil.
     pub keep_levels: bool,

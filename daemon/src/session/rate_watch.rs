@@ -2,7 +2,8 @@
 
 use holod_calibration::TimeNs;
 
-/// So long, and so many frames, after the first frame the rate is known well enough to be said.
+/// The rate is known well enough to be said once this time has passed and this many frames have been shown since the
+/// first.
 const WATCHED: TimeNs = TimeNs(3_000_000_000);
 const FRAMES: u64 = 2;
 

@@ -46,7 +46,7 @@ pub(crate) struct SleepWatch {
 enum News {
     /// The machine is about to sleep, and does so once the lasers are dark.
     Sleeps(oneshot::Sender<()>),
-    /// It is awake.
+    /// It is awake again, or does not sleep after all.
     Awake,
 }
 

@@ -1,4 +1,4 @@
-//! What a run came to.
+//! What is left of a run: its figures as `summary.json` has them, and the levels that were kept of it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -24,11 +24,11 @@ pub struct SessionReport {
 
 /// Levels that the panel showed, and what their frame was made for.
 pub struct ShownLevels {
-    /// The pupil.
+    /// The pupil that the hologram was computed for.
     pub pupil: PupilDiameter,
     /// The amplitude that double phase took as 1.
     pub amplitude_constant: f32,
-    /// The levels.
+    /// What all fields of the frame sent to the panel.
     pub levels: LevelsFrame,
 }
 

@@ -1,4 +1,4 @@
-//! Running numbers of a run.
+//! Counts frames, fields and latencies while a run goes on, from what the frame loop and the output report.
 
 use std::collections::{HashMap, VecDeque};
 

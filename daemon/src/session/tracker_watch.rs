@@ -1,4 +1,4 @@
-//! What a person should hear of the tracker while the loop runs.
+//! What is said of the tracker while the loop runs.
 
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{ClockWatch, Counter, Decision, Figures, RefusalChange, RefusalWatch, TrackerControl};

@@ -26,7 +26,7 @@ const SEQUENCE_BYTES_MAX: u64 = 4 << 30;
 
 /// The frames to show, all of one size.
 pub struct Frames {
-    /// At least one.
+    /// In the order of the sequence; at least one.
     pub frames: Vec<Arc<RgbdFrame>>,
     /// Frames a second of a sequence, which is shown over and over.
     pub fps: Option<f64>,
@@ -39,7 +39,7 @@ pub struct Frames {
 /// A scene from files in figures.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneFigures {
-    /// Its frames.
+    /// Frames of its sequence; 1 for a still.
     pub frames: u64,
     /// Depths of all their files.
     pub depth_px: u64,
@@ -182,7 +182,7 @@ fn available_bytes() -> Option<u64> {
     line.split_whitespace().next()?.parse::<u64>().ok()?.checked_mul(1024)
 }
 
-/// Says why a sequence of so many frames cannot be kept in memory, where it cannot.
+/// Says why a sequence of this length cannot be kept in memory, where it cannot.
 fn sequence_fits(frames: u64, resolution: Resolution, available_bytes: Option<u64>) -> Result<(), String> {
     let frame_bytes = (resolution.pixels() * 4 * size_of::<f32>()) as u64;
     let needed = frames.saturating_mul(frame_bytes);

@@ -44,7 +44,7 @@ pub trait Hardware {
     fn feed_watchdog(&mut self);
 }
 
-/// A box.
+/// A box: takes lines of the protocol in and lights lasers on `hardware`.
 #[derive(Debug)]
 pub struct Controller<H> {
     hardware: H,
@@ -67,12 +67,12 @@ impl<H: Hardware> Controller<H> {
         controller
     }
 
-    /// The state machine.
+    /// What may be lit, and why it may not.
     pub fn machine(&self) -> &Machine {
         &self.machine
     }
 
-    /// The board.
+    /// The board that it was made with: pins, clock and line.
     pub fn hardware_mut(&mut self) -> &mut H {
         &mut self.hardware
     }

@@ -23,5 +23,5 @@ pub use line::{Line, LineBuffer};
 pub use machine::{Event, Machine};
 pub use types::{DarkReason, FIELDS_MAX, Laser, Limits, Sequence, State, SyncSeen, TimeUs, Trigger, Window};
 
-/// The protocol's version.
+/// The version of the protocol that is spoken here; a host refuses a box of another one.
 pub const PROTOCOL_VERSION: u32 = 3;

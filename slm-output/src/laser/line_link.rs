@@ -25,7 +25,7 @@ const READ_TIMEOUT: Duration = Duration::from_millis(20);
 /// Something came over the line.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Arrival {
-    /// Bytes.
+    /// What the other end sent, as much of it as one read brought.
     Bytes {
         /// When they had been read.
         t: TimeNs,
@@ -95,7 +95,7 @@ impl Link {
 }
 
 impl Drop for Link {
-    /// Waits until the listener has let go of the line, so that its port can be opened again.
+    /// Waits until the listener has closed the line, so that its port can be opened again.
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Release);
         if let Some(listener) = self.listener.take() {

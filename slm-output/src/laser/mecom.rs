@@ -35,7 +35,7 @@ pub(super) enum Request {
 /// What a device answers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Reply {
-    /// A parameter's value.
+    /// A parameter's value as its 32 bits; of a floating-point one those of an `f32`.
     Value(u32),
     /// It has been set.
     Done,

@@ -42,22 +42,22 @@ use crate::fields::FIELDS;
 /// A laser goes on or off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LaserEdge {
-    /// When.
+    /// Host time, as near as the box's clock is known.
     pub t: TimeNs,
-    /// Which laser.
+    /// Which laser it is, by its colour.
     pub colour: Colour,
-    /// On or off.
+    /// It goes on; else it goes off.
     pub on: bool,
 }
 
 /// One laser, lit from `t_on` to `t_off`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LitWindow {
-    /// Which laser.
+    /// The laser's colour, which is that of the field.
     pub colour: Colour,
-    /// Its on edge.
+    /// Host time of its on edge.
     pub t_on: TimeNs,
-    /// Its off edge.
+    /// Host time of its off edge.
     pub t_off: TimeNs,
 }
 

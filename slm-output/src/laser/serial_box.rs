@@ -68,7 +68,7 @@ pub struct BoxReport {
     pub name: String,
     /// What it is built for.
     pub limits: Limits,
-    /// How it is.
+    /// Armed or dark, what is lit, interlock and sync wire, when it was asked.
     pub state: State,
     /// By how much its time may be mistaken from here, nanoseconds either way.
     pub clock_error_ns: i64,

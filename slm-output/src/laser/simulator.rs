@@ -109,7 +109,7 @@ impl Faults {
         self.corrupt_out.store(true, Ordering::Relaxed);
     }
 
-    /// Pulls the cable, or plugs it in again: what is sent is lost in both directions, and neither end hears of it.
+    /// Pulls the cable, or plugs it in again: what is sent is lost in both directions, and neither end notices.
     pub fn set_cut(&self, cut: bool) {
         self.cut.store(cut, Ordering::Relaxed);
     }
@@ -143,7 +143,7 @@ pub struct SimulatedBox {
     pub name: &'static str,
     /// What it is built for.
     pub limits: Limits,
-    /// Its clock.
+    /// Its microseconds, which begin and drift as those of a real one.
     pub clock: SimulatedClock,
     /// Whether its line can hang up. Without that a host that goes is silence, no more, as on a bare serial line.
     pub sees_hang_up: bool,

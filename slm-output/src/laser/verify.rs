@@ -12,7 +12,7 @@ use super::{DarkReason, LaserEdge};
 /// One colour field that was on the panel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FieldSpan {
-    /// The frame.
+    /// Number of the frame whose pattern it shows.
     pub frame_id: u64,
     /// Position in the field order.
     pub field: usize,
@@ -28,7 +28,7 @@ pub struct FieldSpan {
     pub dark: Option<DarkReason>,
 }
 
-/// What is wrong.
+/// Light that does not go with the fields that were on the panel, or that is missing. Times are the host's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Finding {
@@ -96,16 +96,16 @@ impl fmt::Display for Finding {
     }
 }
 
-/// The judgement.
+/// How the lasers' edges go with the fields that were on the panel.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct EdgeReport {
-    /// Fields judged.
+    /// Fields that were judged: all that were given.
     pub fields: usize,
     /// Of those, fields lit by exactly one window of their own laser, inside their settled time.
     pub lit: usize,
     /// Of those, fields that were meant to stay dark and did.
     pub dark: usize,
-    /// What is wrong.
+    /// Every fault, in the order in which edges and fields were gone through.
     pub findings: Vec<Finding>,
 }
 

@@ -109,7 +109,7 @@ impl OutputControl {
         }
     }
 
-    /// Counters so far.
+    /// What both threads have counted since the start, and how panel and lasers are now.
     pub fn counts(&self) -> OutputCounts {
         self.switch.shared.counts()
     }
@@ -151,7 +151,7 @@ impl OutputControl {
                 report.kept = panel.join().unwrap_or_default();
             }
             laser.thread().unpark();
-            // It may have been late to hear of it.
+            // It may have been told late.
             report.lasers_dark = laser.join().is_ok() && self.switch.is_dark();
         }
         report.counts = self.counts();

@@ -17,11 +17,11 @@ const OPEN_MAX: usize = 256;
 /// One colour field that was on the panel, with what its laser did.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FieldEvent {
-    /// The frame shown.
+    /// Number of the frame whose pattern it shows.
     pub frame_id: u64,
     /// Position in the panel's field order.
     pub field: usize,
-    /// Its colour.
+    /// The colour of its pattern and of its laser.
     pub colour: Colour,
     /// When the frame was submitted.
     pub t_submit: TimeNs,

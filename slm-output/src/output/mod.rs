@@ -77,10 +77,10 @@ impl Default for OutputOptions {
 /// Why the output could not be started.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
-    /// The panel.
+    /// The panel cannot be opened.
     #[error(transparent)]
     Panel(#[from] OpenError),
-    /// The lasers.
+    /// The laser box cannot be opened, refuses its program, or the rig leaves no time for light.
     #[error(transparent)]
     Laser(#[from] LaserError),
     /// A thread could not be started.

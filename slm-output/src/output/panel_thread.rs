@@ -33,7 +33,7 @@ pub(super) enum PanelNews {
 pub enum PanelEvent {
     /// It was lost, and is tried again where the fault is recoverable.
     Lost { t: TimeNs, fault: PanelFault },
-    /// It is back.
+    /// It shows frames again, after a loss that was told.
     Back { t: TimeNs },
 }
 

@@ -10,9 +10,9 @@ use crate::present::{FrameSink, TimestampSource};
 /// What the panel did at the start of a colour frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PresentReport {
-    /// The frame shown.
+    /// Number of the frame that is shown.
     pub frame_id: u64,
-    /// Since when.
+    /// Host time at which its first field came on the panel.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
     pub provenance: TimestampSource,

@@ -295,7 +295,7 @@ fn a_darkness_that_is_over_is_no_reason_for_later_dark_fields() {
             assert!(matches!(dark[..], [(DarkReason::Asked, count)] if count > 45), "{dark:?}");
             bench.laser.shared.dark_request.store(dark_because(2 * NEXT, None), Ordering::Release);
         }
-        // The box hears of each colour frame when its first field has gone by.
+        // The box is told of each colour frame when its first field has gone by.
         let frame_period = bench.laser.scheduler.gate().timing().frame_period;
         let t_late = T_FIRST + TimeNs(42 * frame_period.0);
         bench.run(t_late, TimeNs(0));
@@ -654,7 +654,7 @@ fn a_box_that_answers_more_slowly_than_refreshes_come_is_armed_once_and_not_agai
     }
 }
 
-/// A box that hears of every `each`th window too late, for half of it or for all, and says so only at the next poll.
+/// A box that is told of every `each`th window too late, for half of it or for all, and says so only at the next poll.
 struct Deaf {
     asked: u64,
     each: u64,

@@ -15,7 +15,7 @@ pub enum OpenError {
     /// A connector of a graphics card.
     #[error(transparent)]
     Drm(#[from] drm::DrmError),
-    /// The panel's window.
+    /// A window that fills the panel's monitor.
     #[cfg(feature = "window")]
     #[error("--output window: {0}")]
     Window(#[from] window::WindowError),

@@ -113,7 +113,7 @@ impl FieldGate {
         self.settle
     }
 
-    /// The panel's clockwork.
+    /// Periods and fields of the panel for which the windows were laid out.
     pub fn timing(&self) -> PanelTiming {
         self.timing
     }

@@ -38,13 +38,13 @@ impl Evidence {
 pub struct Orders {
     /// Go dark; nothing else is ordered then.
     pub dark: Option<DarkReason>,
-    /// Be armed.
+    /// Be armed, which lights nothing yet.
     pub arm: bool,
-    /// Hear a heartbeat.
+    /// Take a heartbeat: one that stays out for the box's timeout makes it dark.
     pub heartbeat: bool,
     /// A colour frame began.
     pub sync: Option<TimeNs>,
-    /// Light this window.
+    /// Light this window of host time.
     pub light: Option<LitWindow>,
 }
 

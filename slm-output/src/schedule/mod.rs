@@ -48,7 +48,7 @@ pub struct ShownField {
 /// What is to be done about a field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FieldDecision {
-    /// The field.
+    /// The field that is on the panel.
     pub shown: ShownField,
     /// What the laser box shall do now.
     pub orders: Orders,
@@ -153,7 +153,7 @@ impl FieldScheduler {
             let t_begin = window.t_on.max(now);
             let left = window.t_off - t_begin;
             let taken = self.balance.take(shown.field, left);
-            // What is cut off is its beginning, which a box that hears of it late would miss anyway.
+            // What is cut off is its beginning, which a box that is told late would miss anyway.
             window.t_on = window.t_off - taken;
             if taken == TimeNs(0) {
                 orders.light = None;

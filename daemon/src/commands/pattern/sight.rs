@@ -171,7 +171,7 @@ fn lens_note(
     // What the stop passes are slopes of the phase, in x and in y.
     let passed_m = 2.0 * wave_m2 * stop_frequency(rig, field);
     let panel_px = [optics.resolution.width, optics.resolution.height];
-    // Across and up: what of so many metres around the axis lies on the panel.
+    // Across and up: what of `size_m` around the axis lies on the panel.
     let on_panel_m = |size_m: f64| {
         [0, 1].map(|side| {
             let axis_m = axis_px[side] * optics.pixel_pitch.0;

@@ -215,7 +215,7 @@ fn report_of(
     }
 }
 
-/// The last seconds of all eyes, above so many rows of text: rejected and believed.
+/// The last seconds of all eyes, above `rows_below` rows of text: rejected and believed.
 fn traces(observed: &Observed, now: TimeNs, colours: bool, rows_below: usize) -> String {
     let since_s = |t: TimeNs| (t - now).seconds();
     let points = |wanted: fn(&Verdict) -> bool| -> Vec<(f64, f64)> {

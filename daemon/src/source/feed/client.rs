@@ -50,7 +50,7 @@ pub(super) enum Refusal {
     Pictures,
     /// It does not read what holod sends.
     Deaf,
-    /// Its socket failed.
+    /// Reading from its socket or writing to it failed.
     Socket,
 }
 

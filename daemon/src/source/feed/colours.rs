@@ -25,7 +25,7 @@ impl ClippedPixels {
         [("above_white", self.above_white), ("below_black", self.below_black)]
     }
 
-    /// All of them.
+    /// Pixels of both kinds.
     pub const fn in_all(&self) -> u64 {
         self.above_white + self.below_black
     }

@@ -6,11 +6,11 @@ use serde::{Deserialize, Serialize};
 /// Depths that cannot be shown as they are, in pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BadDepths {
-    /// Not a number.
+    /// NaN, which floating-point depths alone can have.
     pub nan: u64,
     /// 0, where that is no depth.
     pub zero: u64,
-    /// Below 0.
+    /// Below 0, minus infinity included.
     pub negative: u64,
     /// Infinite, where that is no depth.
     pub infinite: u64,
@@ -58,7 +58,7 @@ impl BadDepths {
         ]
     }
 
-    /// All of them.
+    /// Pixels of all kinds; none is counted twice.
     pub fn in_all(&self) -> u64 {
         self.entries().into_iter().map(|(_, pixels)| pixels).sum()
     }

@@ -217,7 +217,7 @@ impl Layout {
 /// What became of a picture.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Outcome {
-    /// It was read.
+    /// It was read whole and takes the place of the one before.
     Taken,
     /// A newer one came before it was read.
     Overtaken,

@@ -60,7 +60,7 @@ const SOCKET: &str = "feed";
 /// What to listen for.
 #[derive(Clone, Debug)]
 pub struct FeedPlan {
-    /// Where.
+    /// Path of the Unix socket to listen at.
     pub socket: PathBuf,
     /// Size of the frames.
     pub resolution: Resolution,
@@ -83,10 +83,10 @@ impl FeedPlan {
 /// What can be said of the feed.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct FeedStatus {
-    /// The socket.
+    /// Path of the Unix socket that clients connect to.
     #[serde(serialize_with = "crate::results::path_text")]
     pub socket: PathBuf,
-    /// Who is connected.
+    /// Names that the connected clients gave themselves.
     pub clients: Vec<String>,
     /// Whose pictures are shown.
     pub shown: Option<String>,
@@ -186,7 +186,7 @@ impl FeedStatus {
     }
 }
 
-/// Whether pictures come.
+/// Whether pictures of clients come, and are what is shown.
 #[derive(Clone, Copy, Debug)]
 pub struct FeedPulse {
     /// When the newest picture was taken over.
@@ -270,7 +270,7 @@ impl Feed {
         Ok(Self { _plan: Arc::clone(plan), place, sink: shown, stop, thread: Some(thread), status })
     }
 
-    /// Whether pictures come.
+    /// When the newest picture came, and whether pictures of clients are shown.
     pub fn pulse(&self) -> FeedPulse {
         FeedPulse {
             t_newest: self.status.lock().unwrap_or_else(PoisonError::into_inner).t_newest,

@@ -80,7 +80,7 @@ impl Slots {
         self.waiting.is_some()
     }
 
-    /// The slot is the client's again; it must hear of it after this.
+    /// The slot is the client's again, who must be told after this.
     pub(super) fn free(&mut self, picture: &Picture) {
         self.held[picture.slot] = false;
     }

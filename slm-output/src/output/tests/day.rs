@@ -16,7 +16,7 @@ use crate::pacing::FramePlan;
 
 const S: i64 = 1_000 * MS;
 const MINUTE: i64 = 60 * S;
-/// One of so many minutes is a bad one; the one after it begins with what is left of it.
+/// One minute in this many is a bad one; the one after it begins with what is left of it.
 const BAD_EVERY: i64 = 8;
 /// Faults of a bad minute begin this long before its end, so that the longest is over and made good by then.
 const CALM: i64 = 35 * S;

@@ -10,11 +10,11 @@ pub(crate) const COLOUR_MODEL: &str = "colour model of the link";
 pub struct DisplayCheck {
     /// What was looked at.
     pub name: String,
-    /// What it is.
+    /// What was read back, or that nothing was.
     pub found: String,
     /// What it must be.
     pub wanted: String,
-    /// What follows.
+    /// What follows for lasers and levels.
     pub verdict: Verdict,
 }
 

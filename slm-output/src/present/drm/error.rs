@@ -31,7 +31,7 @@ pub enum DrmError {
         asked: String,
         there: ConnectorList,
     },
-    /// More than one.
+    /// Several connectors are called so.
     #[error("`{asked}` is more than one: {there}. Add `,card=/dev/dri/cardN`, or name the monitor's serial number")]
     Ambiguous {
         /// What was asked for.

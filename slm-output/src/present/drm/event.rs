@@ -33,7 +33,7 @@ pub(crate) enum Uevent {
     Changed,
     /// The card is gone.
     Removed,
-    /// Nothing.
+    /// It is about something else.
     Other,
 }
 

@@ -13,7 +13,7 @@ const KERNEL_GROUP: u32 = 1;
 /// The kernel's messages are shorter.
 const MESSAGE_BYTES: usize = 4096;
 
-/// The socket on which the kernel tells of devices.
+/// The socket on which the kernel announces changes of devices.
 #[derive(Debug)]
 pub(crate) struct Hotplug(OwnedFd);
 

@@ -65,8 +65,8 @@ pub struct DrmTarget {
 
 /// A panel on a connector of a graphics card.
 ///
-/// A refresh is reported once its time has come: drivers tell of a flip when the blank before it begins. A refresh on
-/// which a flip came too late is not reported; the count of the next one tells of it.
+/// A refresh is reported once its time has come: drivers report a flip when the blank before it begins. A refresh on
+/// which a flip came too late is not reported; it shows in the count of the next one.
 #[derive(Debug)]
 pub struct DrmPanel {
     wanted: Wanted,

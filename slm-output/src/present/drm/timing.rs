@@ -29,7 +29,7 @@ pub struct FlipStamp {
 /// What is known of the refresh on which a flip was shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Refresh {
-    /// Start of scan-out.
+    /// Host time at which its scan-out begins: the end of the blank before it.
     pub t_present: TimeNs,
     /// [`TimestampSource::Hardware`] where the event is believed; [`TimestampSource::Estimated`] where it is not but
     /// earlier ones tell the time; [`TimestampSource::Software`] where only the event's arrival is known.

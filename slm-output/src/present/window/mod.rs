@@ -95,10 +95,10 @@ pub enum WindowError {
         /// As the environment names it.
         socket: PathBuf,
     },
-    /// It failed.
+    /// The display server ended the connection, or refused what a window needs.
     #[error("{server}: {reason}")]
     Server { server: String, reason: String },
-    /// It says nothing.
+    /// The display server answers nothing.
     #[error("{server} has not answered for {waited_s} s: does it hang?")]
     Silent {
         server: String,
@@ -523,7 +523,7 @@ impl Presenter for WindowPanel {
         frames: &mut FrameSource,
         presented: &mut dyn FnMut(PresentedRefresh),
     ) -> Result<(), PanelFault> {
-        // A panel that is lost is closed when it is opened again: that takes time, and the lasers must hear of it now.
+        // A panel that is lost is closed when it is opened again: that takes time, and the lasers must go out now.
         self.collect()?;
         // What came arrived after `now`, perhaps.
         self.report_due(host_now(), presented);

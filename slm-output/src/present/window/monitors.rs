@@ -131,13 +131,13 @@ impl fmt::Display for PanelMonitor {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum MonitorError {
-    /// Nothing is connected.
+    /// No monitor is lit.
     #[error("the display server has no lit monitor; connect the panel and switch it on in the monitor settings")]
     NoneThere,
     /// No monitor has that name.
     #[error("no monitor is called \"{wanted}\"; there is {}", list(there))]
     NotThere { wanted: String, there: Vec<Monitor> },
-    /// Several have it.
+    /// Several monitors are called so.
     #[error("\"{wanted}\" is more than one monitor: {}; name it by its connector or serial number", list(called))]
     Ambiguous {
         wanted: String,

@@ -20,7 +20,7 @@ pub(super) struct Presented {
 /// What became of the presentation that is on its way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Outcome {
-    /// The completion belongs to another presentation, or tells of one a second time.
+    /// The completion belongs to another presentation, or is the second one of the same.
     NotThis,
     /// It was never shown.
     Skipped,

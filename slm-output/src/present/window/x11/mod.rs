@@ -242,7 +242,7 @@ impl View {
             || self.monitors()?.iter().any(|monitor| monitor.connector.starts_with("XWAYLAND")))
     }
 
-    /// From now on hears of `window`, and shows it.
+    /// Asks for the events of `window`, and shows it.
     fn watch(&mut self, window: u32) -> Result<(), X11Error> {
         self.window = window;
         let events = EventMask::STRUCTURE_NOTIFY | EventMask::VISIBILITY_CHANGE;
