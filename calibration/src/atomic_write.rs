@@ -40,8 +40,8 @@ fn is_open_file(path: &Path) -> bool {
     false
 }
 
-/// The folder in which a path's last part is.
-fn folder_of(path: &Path) -> &Path {
+/// The folder in which a path's last part is; `.` for a bare name.
+pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 

@@ -17,7 +17,7 @@ pub mod rig;
 pub mod toml_source;
 mod units;
 
-pub use atomic_write::{special_file, write_atomically};
+pub use atomic_write::{folder_of, special_file, write_atomically};
 pub use clock::host_now;
 pub use device::{KEPT_BY_UNIT, is_kept_by_unit, unit_keeps};
 pub use geometry::DisplayGeometry;

@@ -134,10 +134,8 @@ pub(crate) fn check_pupil(weights: &Weights, bench: &DisplayGeometry, pupil: Pup
 /// What weights are called in reports.
 pub fn weights_name(weights: &WeightsChoice) -> String {
     match weights {
-        WeightsChoice::Standard => "standard".into(),
-        WeightsChoice::Small => "small".into(),
-        WeightsChoice::Fast => "fast".into(),
         WeightsChoice::File(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
+        built_in => built_in.built_in_name().unwrap_or_default().into(),
     }
 }
 

@@ -6,6 +6,7 @@
 
 use std::hint::black_box;
 
+use holod_calibration::Sorted;
 use holod_pupil_input::wire::line::{LineSample, encode_line};
 use holod_pupil_input::wire::{Decoder, WireEvent};
 use holod_pupil_input::{Profile, SampleEye};
@@ -78,7 +79,7 @@ fn measure(case: &Case) {
         theirs.push(cpu_s() - begin_s);
     }
     assert!(samples * 10 >= messages.len() as u64 * 9, "{}: {samples} of {}", case.profile, messages.len());
-    let (ours, theirs) = (median(ours), median(theirs));
+    let [ours, theirs] = [ours, theirs].map(|seconds| Sorted::new(seconds).expect("at least one run").median());
     let megabytes = bytes.len() as f64 / 1e6;
     println!(
         "{:16} {:9.0} {:10.0} {:7.2}x  {} at {:.0} MB/s",
@@ -108,11 +109,6 @@ fn decode(decoder: &mut dyn Decoder, pushes: &[&[u8]]) -> u64 {
         });
     }
     samples
-}
-
-fn median(mut seconds: Vec<f64>) -> f64 {
-    seconds.sort_by(f64::total_cmp);
-    seconds[seconds.len() / 2]
 }
 
 impl Peer {

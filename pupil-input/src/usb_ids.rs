@@ -22,10 +22,15 @@ impl FromStr for UsbIds {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let number = |part: &str| (part.len() <= 4).then(|| u16::from_str_radix(part, 16).ok()).flatten();
-        let ids = text.split_once(':').and_then(|(vendor, product)| number(vendor).zip(number(product)));
-        let (vendor, product) =
-            ids.ok_or_else(|| format!("`{text}` is no USB VID:PID, two hexadecimal numbers such as 1209:0001"))?;
+        let (vendor, product) = hexadecimal_pair(text)
+            .ok_or_else(|| format!("`{text}` is no USB VID:PID, two hexadecimal numbers such as 1209:0001"))?;
         Ok(Self { vendor, product })
     }
+}
+
+/// The two numbers of `1209:0001`, of up to four digits each.
+pub(crate) fn hexadecimal_pair(text: &str) -> Option<(u16, u16)> {
+    let number = |part: &str| (part.len() <= 4).then(|| u16::from_str_radix(part, 16).ok()).flatten();
+    let (first, second) = text.split_once(':')?;
+    number(first).zip(number(second))
 }

@@ -378,6 +378,11 @@ impl WeightsChoice {
     /// The names of the built-in networks in a rig file and on the command line.
     pub const BUILT_IN: [(&'static str, Self); 3] =
         [("standard", Self::Standard), ("small", Self::Small), ("fast", Self::Fast)];
+
+    /// The name of a built-in one.
+    pub fn built_in_name(&self) -> Option<&'static str> {
+        Self::BUILT_IN.into_iter().find_map(|(name, choice)| (choice == *self).then_some(name))
+    }
 }
 
 /// What an eye of normal acuity resolves: one minute of arc, in radians.

@@ -366,21 +366,21 @@ fn read_field_timing<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<Fiel
 
 /// `mode`, with the colour that monochrome mode shows.
 fn read_mode<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<PanelMode> {
-    let modes = ["channel-packed", "field-sequential", "monochrome"].map(|name| (name, name));
-    let mode = reader.choice(panel, "mode", &modes, true);
-    let monochrome = mode.is_some_and(|mode| mode.value == "monochrome");
+    // Which colour monochrome mode shows, the other key says.
+    let modes = [PanelMode::ChannelPacked, PanelMode::FieldSequential, PanelMode::Monochrome(Colour::Red)];
+    let mode = reader.choice(panel, "mode", &modes.map(|mode| (mode.name(), mode)), true);
+    let monochrome = mode.is_some_and(|mode| matches!(mode.value, PanelMode::Monochrome(_)));
     let colours = Colour::ALL.map(|colour| (colour.name(), colour));
     let colour = reader.choice(panel, "colour", &colours, monochrome);
     match (mode?.value, colour) {
-        ("monochrome", colour) => Some(PanelMode::Monochrome(colour?.value)),
+        (PanelMode::Monochrome(_), colour) => Some(PanelMode::Monochrome(colour?.value)),
         (other, Some(colour)) => {
-            let found = format!("a single colour in {other} mode");
+            let found = format!("a single colour in {} mode", other.name());
             let advice = "take colour out, or write mode = \"monochrome\"".into();
             reader.fault_in(panel, "colour", colour.line, &found, "colour in monochrome mode only", advice);
             None
         }
-        ("field-sequential", None) => Some(PanelMode::FieldSequential),
-        (_, None) => Some(PanelMode::ChannelPacked),
+        (mode, None) => Some(mode),
     }
 }
 

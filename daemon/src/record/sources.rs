@@ -280,10 +280,9 @@ pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Res
     if let Some(path) = &rig.provenance.laser_profile_file {
         document["lasers"]["profile_file"] = keep(path, LASERS.into())?;
     }
-    let named = WeightsChoice::BUILT_IN.into_iter().find(|(_, choice)| *choice == rig.model.weights);
-    let (key, other, named) = match (&rig.model.weights, named) {
+    let (key, other, named) = match (&rig.model.weights, rig.model.weights.built_in_name()) {
         (WeightsChoice::File(path), _) => ("weights_file", "network", keep(path, WEIGHTS.into())?),
-        (_, Some((name, _))) => ("network", "weights_file", value(name)),
+        (_, Some(name)) => ("network", "weights_file", value(name)),
         (_, None) => return Err(Failure::new(Exit::Software, "weights without a name")),
     };
     let model = document.entry("model").or_insert(toml_edit::table());

@@ -8,7 +8,7 @@
 use std::io::Read;
 use std::path::Path;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{TimeNs, folder_of};
 
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
@@ -241,7 +241,7 @@ fn read_native(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayE
 fn other_parts(path: &Path) -> Vec<String> {
     let own = name_of(path);
     let Some((begin, _)) = own.split_once(" ps") else { return Vec::new() };
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder_of(path);
     let is_part = |name: &String| {
         let rest = name.strip_prefix(begin).and_then(|rest| rest.strip_prefix(" ps")?.strip_suffix(".raw"));
         *name != own

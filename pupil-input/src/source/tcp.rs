@@ -120,7 +120,7 @@ impl Feed for TcpFeed {
     fn open(&mut self) -> Result<Box<dyn ByteSource>, SourceError> {
         let stream = self.connect()?;
         let NetworkSettings { start, stop, .. } = &self.settings;
-        let link = StartedLink::start(Connection(stream), start, stop).map_err(|problem| NetworkError::Command {
+        let link = StartedLink::start(stream, start, stop).map_err(|problem| NetworkError::Command {
             address: self.address.clone(),
             profile: self.profile.clone(),
             problem: Box::new(problem),
@@ -129,14 +129,12 @@ impl Feed for TcpFeed {
     }
 }
 
-struct Connection(TcpStream);
-
-impl Dialogue for Connection {
+impl Dialogue for TcpStream {
     fn send(&mut self, bytes: &[u8]) -> io::Result<()> {
-        self.0.write_all(bytes)
+        self.write_all(bytes)
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        receive_from(&mut self.0, buffer)
+        receive_from(self, buffer)
     }
 }

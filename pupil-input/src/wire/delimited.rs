@@ -3,6 +3,7 @@
 //! A line ends in LF, CR or both. Columns are counted from 1, or named by a header line: on the wire, or in the
 //! profile.
 
+use super::buffer::Beginning;
 use super::checksum::{Checksum, ChecksumKind};
 use super::field::{Fields, Layout, Message, Raw};
 use super::{Decoder, WireEvent, WireFault};
@@ -57,9 +58,7 @@ pub enum Column {
 #[derive(Clone, Debug)]
 pub struct DelimitedDecoder {
     /// What has come of a line that was cut by the end of a push.
-    line: Box<[u8; MAX_LINE_BYTES]>,
-    used: usize,
-    overlong: bool,
+    line: Beginning,
     rows: Rows,
 }
 
@@ -139,7 +138,7 @@ impl DelimitedDecoder {
             fields: Fields::new(layout),
         };
         rows.columns.count_needed();
-        Self { line: Box::new([0; MAX_LINE_BYTES]), used: 0, overlong: false, rows }
+        Self { line: Beginning::new(MAX_LINE_BYTES), rows }
     }
 
     /// A decoder for a stream that may be joined in the middle of a line: the first line, unless a checksum holds it to
@@ -150,22 +149,14 @@ impl DelimitedDecoder {
         decoder
     }
 
-    fn keep(&mut self, piece: &[u8]) {
-        let room = MAX_LINE_BYTES - self.used;
-        self.overlong |= piece.len() > room;
-        let piece = &piece[..piece.len().min(room)];
-        self.line[self.used..self.used + piece.len()].copy_from_slice(piece);
-        self.used += piece.len();
-    }
-
     fn end_kept(&mut self, on_event: &mut dyn FnMut(WireEvent)) {
-        let (used, overlong) = (std::mem::take(&mut self.used), std::mem::take(&mut self.overlong));
-        if overlong {
+        if self.line.overlong {
             let joined = std::mem::take(&mut self.rows.first);
             on_event(if joined { WireEvent::Partial } else { WireEvent::Rejected(WireFault::TooLong) });
         } else {
-            self.rows.take(&self.line[..used], on_event);
+            self.rows.take(self.line.bytes(), on_event);
         }
+        self.line.clear();
     }
 }
 
@@ -174,26 +165,27 @@ impl Decoder for DelimitedDecoder {
         let mut rest = bytes;
         while let Some(end) = rest.iter().position(|byte| matches!(byte, b'\n' | b'\r')) {
             let (piece, behind) = (&rest[..end], &rest[end + 1..]);
-            if self.used > 0 || piece.len() > MAX_LINE_BYTES {
-                self.keep(piece);
+            if !self.line.bytes().is_empty() || piece.len() > MAX_LINE_BYTES {
+                self.line.push(piece);
                 self.end_kept(on_event);
             } else {
                 self.rows.take(piece, on_event);
             }
             rest = behind;
         }
-        self.keep(rest);
+        self.line.push(rest);
     }
 
     fn finish(&mut self, on_event: &mut dyn FnMut(WireEvent)) {
-        if self.used > 0 {
+        if !self.line.bytes().is_empty() {
             self.end_kept(on_event);
         }
     }
 
     /// A header stays known.
     fn rejoin(&mut self) -> bool {
-        (self.used, self.overlong, self.rows.first) = (0, false, true);
+        self.line.clear();
+        self.rows.first = true;
         true
     }
 }

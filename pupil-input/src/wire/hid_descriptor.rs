@@ -10,6 +10,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use crate::usb_ids::hexadecimal_pair;
+
 /// Bytes of the longest descriptor: Linux takes no longer one.
 pub const MAX_DESCRIPTOR_BYTES: usize = 4096;
 /// Input fields of one descriptor at most.
@@ -76,11 +78,9 @@ impl FromStr for Usage {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let number = |part: &str| (part.len() <= 4).then(|| u16::from_str_radix(part, 16).ok()).flatten();
-        let usage = text.split_once(':').and_then(|(page, id)| number(page).zip(number(id)));
-        usage
-            .map(|(page, id)| Self { page, id })
-            .ok_or_else(|| format!("`{text}` is no page and number in hexadecimals, such as ff00:0030"))
+        let (page, id) = hexadecimal_pair(text)
+            .ok_or_else(|| format!("`{text}` is no page and number in hexadecimals, such as ff00:0030"))?;
+        Ok(Self { page, id })
     }
 }
 

@@ -6,6 +6,7 @@
 //! stand in the data as well. All words are 0 while no pupil is seen. (Layout: the ISCAN drivers of MWorks and of
 //! pype.)
 
+use super::buffer::Buffer;
 use super::{Decoder, WireEvent, WireFault, WireSample};
 use crate::SampleEye;
 
@@ -43,8 +44,7 @@ pub struct IscanDecoder {
     settings: IscanSettings,
     packet_bytes: usize,
     /// What is kept: in step, the packet before and what has come of this one; else what is searched.
-    kept: Box<[u8]>,
-    used: usize,
+    kept: Buffer,
     /// Where in `kept` this packet begins, or what is not searched yet.
     at: usize,
     step: Step,
@@ -67,8 +67,7 @@ impl IscanDecoder {
         Self {
             settings,
             packet_bytes,
-            kept: vec![0; 4 * packet_bytes].into_boxed_slice(),
-            used: 0,
+            kept: Buffer::new(4 * packet_bytes),
             at: 0,
             step: Step::Joining,
             patience: packet_bytes,
@@ -79,7 +78,7 @@ impl IscanDecoder {
     fn advance(&mut self, on_event: &mut dyn FnMut(WireEvent)) {
         let length = self.packet_bytes;
         loop {
-            let come = self.used - self.at;
+            let come = self.kept.held().len() - self.at;
             if self.step != Step::In {
                 if come < length + SYNC.len() {
                     return;
@@ -103,16 +102,15 @@ impl IscanDecoder {
             } else if come < length {
                 return;
             } else {
-                tell(&self.settings, &self.kept[self.at + SYNC.len()..self.at + length], on_event);
-                self.kept.copy_within(self.at..self.used, 0);
-                self.used -= self.at;
+                tell(&self.settings, &self.kept.held()[self.at + SYNC.len()..self.at + length], on_event);
+                self.kept.drop_front(self.at);
                 self.at = length;
             }
         }
     }
 
     fn begins_at(&self, at: usize) -> bool {
-        self.kept[at..].starts_with(&SYNC)
+        self.kept.held()[at..].starts_with(&SYNC)
     }
 
     fn skip(&mut self, on_event: &mut dyn FnMut(WireEvent)) {
@@ -124,8 +122,7 @@ impl IscanDecoder {
             self.patience = self.packet_bytes;
         }
         if self.at == self.packet_bytes {
-            self.kept.copy_within(self.at..self.used, 0);
-            self.used -= self.at;
+            self.kept.drop_front(self.at);
             self.at = 0;
         }
     }
@@ -134,16 +131,13 @@ impl IscanDecoder {
 impl Decoder for IscanDecoder {
     fn push(&mut self, mut bytes: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
         while !bytes.is_empty() {
-            let taken = bytes.len().min(self.packet_bytes);
-            self.kept[self.used..self.used + taken].copy_from_slice(&bytes[..taken]);
-            self.used += taken;
-            bytes = &bytes[taken..];
+            bytes = self.kept.fill(bytes);
             self.advance(on_event);
         }
     }
 
     fn finish(&mut self, _on_event: &mut dyn FnMut(WireEvent)) {
-        self.used = 0;
+        self.kept.clear();
         self.at = 0;
         self.step = Step::Joining;
         self.patience = self.packet_bytes;

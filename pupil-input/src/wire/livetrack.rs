@@ -58,14 +58,14 @@ impl Default for LiveTrackSettings {
 #[derive(Clone, Debug)]
 pub struct LiveTrackDecoder {
     settings: LiveTrackSettings,
-    lines: LineBuffer<MAX_LINE_BYTES>,
+    lines: LineBuffer,
     frames: FrameCounter,
 }
 
 impl LiveTrackDecoder {
     /// A decoder for a stream that may be joined in the middle of a row.
-    pub const fn new(settings: LiveTrackSettings) -> Self {
-        Self { settings, lines: LineBuffer::joining(), frames: FrameCounter { last: None } }
+    pub fn new(settings: LiveTrackSettings) -> Self {
+        Self { settings, lines: LineBuffer::joining(MAX_LINE_BYTES), frames: FrameCounter { last: None } }
     }
 }
 

@@ -3,6 +3,7 @@
 //! A decoder is pushed bytes as they come and tells what they hold. However the bytes of a stream are split, the events
 //! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
+mod buffer;
 mod checksum;
 pub mod delimited;
 pub mod field;

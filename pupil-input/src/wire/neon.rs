@@ -26,6 +26,7 @@ use std::io::Write;
 
 use holod_calibration::TimeNs;
 
+use super::buffer::Buffer;
 use super::{Decoder, WireEvent, WireFault, WireSample};
 use crate::SampleEye;
 
@@ -49,8 +50,7 @@ const UNIX_IN_NTP_S: i64 = 2_208_988_800;
 /// RTSP bytes in, samples out; the same samples however the bytes are split.
 #[derive(Clone, Debug)]
 pub(crate) struct NeonDecoder {
-    held: [u8; MAX_TEXT_BYTES],
-    used: usize,
+    buffer: Buffer,
     step: Step,
     stream: Stream,
 }
@@ -84,21 +84,22 @@ impl Default for NeonDecoder {
 
 impl NeonDecoder {
     /// A decoder that waits for the beginning of a message.
-    pub(crate) const fn new() -> Self {
-        Self { held: [0; MAX_TEXT_BYTES], used: 0, step: Step::Joining, stream: Stream::new() }
+    pub(crate) fn new() -> Self {
+        Self { buffer: Buffer::new(MAX_TEXT_BYTES), step: Step::Joining, stream: Stream::new() }
     }
 
     /// Reads the whole messages that are held and keeps the rest.
     fn read_held(&mut self, on_event: &mut dyn FnMut(WireEvent)) {
+        let held = self.buffer.held();
         let mut at = 0;
         loop {
-            let rest = &self.held[at..self.used];
+            let rest = &held[at..];
             match front(rest) {
                 Front::Unknown if rest.len() < MAX_TEXT_BYTES => break,
                 Front::Packet(length) => {
                     self.step = Step::In;
                     at += FRAME_HEADER_BYTES;
-                    self.stream.read_packet(&self.held[at..at + length], on_event);
+                    self.stream.read_packet(&held[at..at + length], on_event);
                     at += length;
                 }
                 Front::Text(length) => {
@@ -118,31 +119,25 @@ impl NeonDecoder {
                     }
                     self.step = Step::Out;
                     at += 1;
-                    at += self.held[at..self.used]
-                        .iter()
-                        .position(|byte| matches!(byte, b'$' | b'R'))
-                        .unwrap_or(self.used - at);
+                    let rest = &held[at..];
+                    at += rest.iter().position(|byte| matches!(byte, b'$' | b'R')).unwrap_or(rest.len());
                 }
             }
         }
-        self.held.copy_within(at..self.used, 0);
-        self.used -= at;
+        self.buffer.drop_front(at);
     }
 }
 
 impl Decoder for NeonDecoder {
     fn push(&mut self, mut bytes: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
         while !bytes.is_empty() {
-            let (now, later) = bytes.split_at(bytes.len().min(self.held.len() - self.used));
-            self.held[self.used..][..now.len()].copy_from_slice(now);
-            self.used += now.len();
+            bytes = self.buffer.fill(bytes);
             self.read_held(on_event);
-            bytes = later;
         }
     }
 
     fn finish(&mut self, _on_event: &mut dyn FnMut(WireEvent)) {
-        self.used = 0;
+        self.buffer.clear();
     }
 }
 

@@ -46,13 +46,13 @@ pub struct OpenGazeSettings {
 #[derive(Clone, Debug)]
 pub struct OpenGazeDecoder {
     settings: OpenGazeSettings,
-    lines: LineBuffer<MAX_LINE_BYTES>,
+    lines: LineBuffer,
 }
 
 impl OpenGazeDecoder {
     /// A decoder for a stream that may be joined in the middle of a line.
-    pub const fn new(settings: OpenGazeSettings) -> Self {
-        Self { settings, lines: LineBuffer::joining() }
+    pub fn new(settings: OpenGazeSettings) -> Self {
+        Self { settings, lines: LineBuffer::joining(MAX_LINE_BYTES) }
     }
 }
 

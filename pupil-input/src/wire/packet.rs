@@ -4,6 +4,7 @@
 //! checksum or, where it has none, by the sync word of the next one just behind it. As long as packet follows upon
 //! packet, each is read as soon as it is whole.
 
+use super::buffer::Buffer;
 use super::checksum::{Checksum, ChecksumKind};
 use super::field::{Bytes, Field, Fields, Layout, Message, place};
 use super::{Decoder, WireEvent, WireFault};
@@ -64,8 +65,7 @@ pub struct PacketDecoder {
     length: PacketLength,
     checksum: Option<(Checksum, PacketChecksum)>,
     fields: Fields<Field>,
-    buffer: Box<[u8]>,
-    used: usize,
+    buffer: Buffer,
     footing: Footing,
 }
 
@@ -103,8 +103,7 @@ impl PacketDecoder {
             checksum: settings.checksum.clone().map(|checksum| (Checksum::new(checksum.kind), checksum)),
             fields: Fields::new(settings.layout.clone()),
             // A packet and the sync word behind it are in sight together.
-            buffer: vec![0; (most + settings.sync.len()).max(2048) * 2].into_boxed_slice(),
-            used: 0,
+            buffer: Buffer::new((most + settings.sync.len()).max(2048) * 2),
             footing: Footing::Held,
         }
     }
@@ -117,12 +116,13 @@ impl PacketDecoder {
 
     /// Reads what the buffer holds, as far as it can be told.
     fn read(&mut self, ended: bool, on_event: &mut dyn FnMut(WireEvent)) {
+        let held = self.buffer.held();
         let mut start = 0;
-        while start < self.used {
-            let bytes = &self.buffer[start..self.used];
+        while start < held.len() {
+            let bytes = &held[start..];
             match self.head(bytes, ended) {
                 Head::Packet(length) => {
-                    let packet = &self.buffer[start..start + length];
+                    let packet = &bytes[..length];
                     if let Err(fault) = self.fields.read(&Bytes(packet), on_event) {
                         on_event(WireEvent::Rejected(fault));
                     }
@@ -142,8 +142,7 @@ impl PacketDecoder {
                 Head::Open => break,
             }
         }
-        self.buffer.copy_within(start..self.used, 0);
-        self.used -= start;
+        self.buffer.drop_front(start);
     }
 
     fn head(&self, bytes: &[u8], ended: bool) -> Head {
@@ -203,17 +202,14 @@ impl PacketChecksum {
 impl Decoder for PacketDecoder {
     fn push(&mut self, mut bytes: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
         while !bytes.is_empty() {
-            let (now, later) = bytes.split_at(bytes.len().min(self.buffer.len() - self.used));
-            self.buffer[self.used..self.used + now.len()].copy_from_slice(now);
-            self.used += now.len();
-            bytes = later;
+            bytes = self.buffer.fill(bytes);
             self.read(false, on_event);
         }
     }
 
     fn finish(&mut self, on_event: &mut dyn FnMut(WireEvent)) {
         self.read(true, on_event);
-        self.used = 0;
+        self.buffer.clear();
     }
 }
 

@@ -36,6 +36,7 @@
 
 use holod_calibration::TimeNs;
 
+use super::buffer::Beginning;
 use super::text::{Line, LineBuffer, number, size, time};
 use super::{Decoder, WireEvent, WireFault, WireSample};
 use crate::SampleEye;
@@ -113,7 +114,7 @@ pub struct PupilExtDecoder {
 
 #[derive(Clone, Debug)]
 enum Reader {
-    Csv { delimiter: u8, lines: Box<LineBuffer<MAX_LINE_BYTES>> },
+    Csv { delimiter: u8, lines: LineBuffer },
     Json(Box<Scanner>),
 }
 
@@ -121,7 +122,9 @@ impl PupilExtDecoder {
     /// A decoder for a stream that may be joined in the middle of a message.
     pub fn new(settings: PupilExtSettings) -> Self {
         let reader = match settings.container {
-            PupilExtContainer::Csv { delimiter } => Reader::Csv { delimiter, lines: Box::new(LineBuffer::joining()) },
+            PupilExtContainer::Csv { delimiter } => {
+                Reader::Csv { delimiter, lines: LineBuffer::joining(MAX_LINE_BYTES) }
+            }
             PupilExtContainer::Json => Reader::Json(Box::new(Scanner::joining())),
         };
         Self { settings, reader }
@@ -351,7 +354,8 @@ struct Scanner {
     state: State,
     levels: [Level; MAX_DEPTH],
     depth: usize,
-    token: Token,
+    /// The name or the figure in hand.
+    token: Beginning,
     at_line_start: bool,
     /// Views of which the message in hand has told.
     told: u32,
@@ -398,41 +402,13 @@ struct Level {
     inner_secondary: bool,
 }
 
-/// The beginning of a name or a figure.
-#[derive(Clone, Copy, Debug)]
-struct Token {
-    bytes: [u8; MAX_TOKEN_BYTES],
-    used: usize,
-    overlong: bool,
-}
-
-impl Token {
-    fn keep(&mut self, bytes: &[u8]) {
-        let room = &mut self.bytes[self.used..];
-        let kept = bytes.len().min(room.len());
-        room[..kept].copy_from_slice(&bytes[..kept]);
-        self.used += kept;
-        self.overlong |= kept < bytes.len();
-    }
-
-    /// The text, and none of one that is too long to matter.
-    fn text(&self) -> &[u8] {
-        if self.overlong { &[] } else { &self.bytes[..self.used] }
-    }
-
-    fn clear(&mut self) {
-        self.used = 0;
-        self.overlong = false;
-    }
-}
-
 impl Scanner {
     fn joining() -> Self {
         Self {
             state: State::Outside,
             levels: [Level::default(); MAX_DEPTH],
             depth: 0,
-            token: Token { bytes: [0; MAX_TOKEN_BYTES], used: 0, overlong: false },
+            token: Beginning::new(MAX_TOKEN_BYTES),
             at_line_start: true,
             told: 0,
             crowded: false,
@@ -464,7 +440,7 @@ impl Scanner {
                 bytes = &rest[1..];
             } else {
                 if matches!(self.state, State::Text { .. }) {
-                    self.token.keep(run);
+                    self.token.push(run);
                 }
                 self.at_line_start = false;
                 bytes = rest;
@@ -494,7 +470,7 @@ impl Scanner {
             (State::Text { .. }, b'\n') => self.lose(WireFault::Malformed, on_event),
             (State::Text { name, escaped }, _) => {
                 self.state = State::Text { name, escaped: byte == b'\\' && !escaped };
-                self.token.keep(&[byte]);
+                self.token.push(&[byte]);
             }
             (State::Word, b',' | b'}' | b']') => {
                 self.end_value(settings);
@@ -502,7 +478,7 @@ impl Scanner {
             }
             (State::Word, _) if is_blank => self.end_value(settings),
             (State::Word, _) if byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'+') => {
-                self.token.keep(&[byte]);
+                self.token.push(&[byte]);
             }
             (State::Word, _) => self.lose(WireFault::Malformed, on_event),
             _ if is_blank => {}
@@ -523,7 +499,7 @@ impl Scanner {
             (State::Value | State::Comma, b']') if is_array => self.close(settings, on_event),
             (State::Value, b'-' | b'0'..=b'9' | b'a'..=b'z') => {
                 self.begin_token(State::Word);
-                self.token.keep(&[byte]);
+                self.token.push(&[byte]);
             }
             _ => self.lose(WireFault::Malformed, on_event),
         }
@@ -596,7 +572,7 @@ impl Scanner {
             return self.end_value(settings);
         }
         let two = settings.eyes == PupilExtEyes::Two;
-        let name = self.token.text();
+        let name = text_of(&self.token);
         let level = &mut self.levels[self.depth];
         level.field = Field::by_name(name);
         level.inner_secondary = name == b"Sec";
@@ -616,7 +592,7 @@ impl Scanner {
         let Some(field) = level.field.take() else { return };
         let view = &mut level.view;
         view.known = true;
-        let text = self.token.text();
+        let text = text_of(&self.token);
         let mut keep = |place: &mut Option<f64>| match number(text) {
             Ok(figure) => *place = Some(figure),
             Err(fault) => view.fault = Some(fault),
@@ -635,6 +611,11 @@ impl Scanner {
             Field::OutlineConfidence => keep(&mut view.outline_confidence),
         }
     }
+}
+
+/// A name or a figure; nothing of one that is too long to matter.
+fn text_of(token: &Beginning) -> &[u8] {
+    if token.overlong { &[] } else { token.bytes() }
 }
 
 #[cfg(test)]

@@ -2,14 +2,13 @@
 
 use holod_calibration::TimeNs;
 
+use super::buffer::Beginning;
 use super::{WireEvent, WireFault};
 
-/// Lines of at most `MAX` bytes, however their bytes are split.
+/// Lines, however their bytes are split.
 #[derive(Clone, Debug)]
-pub(super) struct LineBuffer<const MAX: usize> {
-    bytes: [u8; MAX],
-    used: usize,
-    overlong: bool,
+pub(super) struct LineBuffer {
+    line: Beginning,
     /// The next line may have lost its beginning.
     first: bool,
 }
@@ -30,20 +29,20 @@ impl Line<'_> {
     }
 }
 
-impl<const MAX: usize> LineBuffer<MAX> {
-    /// A buffer for a stream that may be joined in the middle of a line.
-    pub(super) const fn joining() -> Self {
-        Self { bytes: [0; MAX], used: 0, overlong: false, first: true }
+impl LineBuffer {
+    /// A buffer for lines of at most `most_bytes`, of a stream that may be joined in the middle of one.
+    pub(super) fn joining(most_bytes: usize) -> Self {
+        Self { line: Beginning::new(most_bytes), first: true }
     }
 
     /// Takes bytes and hands on each line that they end.
     pub(super) fn push(&mut self, mut bytes: &[u8], mut on_line: impl FnMut(Line<'_>)) {
         while let Some(end) = bytes.iter().position(|&byte| byte == b'\n') {
-            self.keep(&bytes[..end]);
+            self.line.push(&bytes[..end]);
             bytes = &bytes[end + 1..];
             self.end_line(&mut on_line);
         }
-        self.keep(bytes);
+        self.line.push(bytes);
     }
 
     /// Hands on the line that has no ending.
@@ -51,20 +50,12 @@ impl<const MAX: usize> LineBuffer<MAX> {
         self.end_line(&mut on_line);
     }
 
-    fn keep(&mut self, bytes: &[u8]) {
-        let room = &mut self.bytes[self.used..];
-        let kept = bytes.len().min(room.len());
-        room[..kept].copy_from_slice(&bytes[..kept]);
-        self.used += kept;
-        self.overlong |= kept < bytes.len();
-    }
-
     fn end_line(&mut self, on_line: &mut impl FnMut(Line<'_>)) {
-        let overlong = std::mem::take(&mut self.overlong);
-        let bytes = trimmed(&self.bytes[..std::mem::take(&mut self.used)]);
+        let (bytes, overlong) = (trimmed(self.line.bytes()), self.line.overlong);
         if !bytes.is_empty() || overlong {
             on_line(Line { bytes, overlong, first: std::mem::take(&mut self.first) });
         }
+        self.line.clear();
     }
 }
 

@@ -1,6 +1,6 @@
 //! The estimate against the true diameter of a made-up eye.
 
-use crate::support::settings;
+use crate::support::{rms, settings};
 use holod_calibration::{PupilDiameter, TimeNs, rig};
 use holod_pupil_input::{
     Decision, Estimator, EstimatorSettings, GateSettings, MockSource, PupilEstimate, PupilSample, PupilState,
@@ -27,11 +27,6 @@ fn followed(
         }
     }
     out
-}
-
-fn rms(errors: impl Iterator<Item = f32>) -> f32 {
-    let (sum, count) = errors.fold((0.0, 0.0), |(sum, count), error| (sum + error * error, count + 1.0));
-    (sum / count).sqrt()
 }
 
 fn sample(t_ms: i64, eye: SampleEye, diameter_mm: f32) -> PupilSample {
@@ -109,7 +104,7 @@ fn the_error_on_a_made_up_eye_is_small() {
         for source in [MockSource::new(scenario, 7), MockSource::new(scenario, 7).without_confidence()] {
             let trace = followed(source, settings(rig::Eye::Left), 32.0, TimeNs(0));
             let settled = || trace.iter().filter(|row| row.0 > 1.0);
-            let error = rms(settled().map(|row| row.2 - row.1));
+            let error = rms(settled().map(|row| f64::from(row.2 - row.1)));
             let tracking = settled().filter(|row| row.3 == PupilState::Tracking);
             let greatest = worst(tracking.map(|row| (row.2 - row.1).abs()));
             eprintln!("{:12} rms {error:.3} mm, worst while tracking {greatest:.3} mm", scenario.name());
@@ -134,7 +129,7 @@ fn noise_is_damped() {
                 errors.push(estimator.pupil_at(t).pupil.mm() - 4.0);
             }
         }
-        let gain = rms(errors.into_iter()) / noise_mm;
+        let gain = rms(errors.into_iter().map(f64::from)) / f64::from(noise_mm);
         eprintln!("noise gain at {rate_hz} Hz: {gain:.2}");
         assert!((0.05..greatest_gain).contains(&gain), "{rate_hz} Hz: {gain}");
     }

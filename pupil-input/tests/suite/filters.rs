@@ -5,7 +5,7 @@
 
 use std::collections::VecDeque;
 
-use crate::support::settings;
+use crate::support::{rms, settings};
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{
     Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Recording, SampleEye, Scenario,
@@ -162,11 +162,6 @@ fn shown(
         }
     }
     out
-}
-
-fn rms(values: impl Iterator<Item = f64>) -> f64 {
-    let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value * value, count + 1.0));
-    (sum / f64::max(count, 1.0)).sqrt()
 }
 
 fn error_mm(trace: &Trace, shown: &[(f64, f64)]) -> f64 {

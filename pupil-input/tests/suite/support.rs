@@ -83,3 +83,9 @@ pub(crate) fn first_below(estimates: &[(TimeNs, PupilEstimate)], least_mm: f32) 
 pub(crate) fn least_raw(samples: &[PupilSample], eye: SampleEye) -> f32 {
     samples.iter().filter(|sample| sample.eye == eye).map(|sample| sample.diameter_mm).fold(f32::MAX, f32::min)
 }
+
+/// Root of the mean square; 0 of no values.
+pub(crate) fn rms(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value * value, count + 1.0));
+    (sum / f64::max(count, 1.0)).sqrt()
+}

@@ -13,6 +13,12 @@ pub(in crate::profile) const EYES: [(&str, SampleEye); 3] = {
     [(left.name(), left), (right.name(), right), (both.name(), both)]
 };
 
+/// The tables that describe a pupil, by key: an eye's own, and that of a pupil whose eye is said elsewhere.
+pub(super) const PUPILS: [(&str, Option<SampleEye>); 4] = {
+    let [left, right, both] = EYES;
+    [(left.0, Some(left.1)), (right.0, Some(right.1)), (both.0, Some(both.1)), ("pupil", None)]
+};
+
 /// What the rest of the profile says about the figures on the wire.
 pub(in crate::profile) struct Context {
     pub(in crate::profile) eye: Option<Found<SampleEye>>,

@@ -2,7 +2,7 @@
 
 use toml_edit::Item;
 
-use super::context::{Context, EYES};
+use super::context::{Context, EYES, PUPILS};
 use crate::SampleEye;
 use crate::profile::reader::{Found, Reader, Section};
 use crate::wire::field::{Figure, Layout, Literal, PupilAt, TimeAt, Validity};
@@ -86,7 +86,7 @@ pub(super) fn read_layout<'a, P: Places<'a>>(
         Some((at, eyes))
     });
     let mut pupils = Vec::new();
-    for (key, own_eye) in EYES.map(|(key, eye)| (key, Some(eye))).into_iter().chain([("pupil", None)]) {
+    for (key, own_eye) in PUPILS {
         let table = wire.section(key);
         if !table.is_there() {
             continue;
@@ -108,8 +108,7 @@ pub(super) fn read_layout<'a, P: Places<'a>>(
             pupils.push(pupil);
         }
     }
-    let keys = ["left", "right", "both", "pupil"];
-    if !keys.into_iter().any(|key| wire.has(key)) {
+    if !PUPILS.iter().any(|(key, _)| wire.has(key)) {
         let expected = "at least one of [wire.left], [wire.right], [wire.both], [wire.pupil]";
         wire.fault("no pupil", expected, "add for example [wire.left] with the place of its size");
     }

@@ -1,6 +1,6 @@
 //! The `[wire]` of trackers whose formats are their makers'.
 
-use super::context::{Context, EYES};
+use super::context::{Context, PUPILS};
 use crate::SampleEye;
 use crate::profile::reader::{Found, Section};
 use crate::size_unit::SizeUnit;
@@ -32,7 +32,7 @@ pub(super) fn read_iscan(wire: &Section<'_>, context: &Context) -> Option<IscanS
         }
     };
     let mut pupils: Vec<IscanPupil> = Vec::new();
-    for (key, own_eye) in EYES.map(|(key, eye)| (key, Some(eye))).into_iter().chain([("pupil", None)]) {
+    for (key, own_eye) in PUPILS {
         let table = wire.section(key);
         if !table.is_there() {
             continue;
@@ -55,7 +55,7 @@ pub(super) fn read_iscan(wire: &Section<'_>, context: &Context) -> Option<IscanS
         let mm_per_count = (scale * diameters * context.size.mm_per_unit) as f32;
         pupils.push(IscanPupil { eye, word, mm_per_count });
     }
-    if !["left", "right", "both", "pupil"].into_iter().any(|key| wire.has(key)) {
+    if !PUPILS.iter().any(|(key, _)| wire.has(key)) {
         let advice = "add for example left = { word = 3 }";
         wire.fault("no pupil", "at least one of left, right, both and pupil", advice);
     }
