@@ -134,11 +134,11 @@ impl Curve {
         let mut phases_rad: Vec<f64> = Vec::new();
         for _ in 0..ROUNDS {
             let share = |row: usize| (rows[row].power - floor) / height;
-            let told = |row: usize| match phases_rad.get(row) {
-                Some(&phase_rad) => Told::near(phase_rad, share(row)),
-                None => Told::by_branch(share(row), turns.partition_point(|&turn| turn < row)),
+            let reading = |row: usize| match phases_rad.get(row) {
+                Some(&phase_rad) => PhaseReading::near(phase_rad, share(row)),
+                None => PhaseReading::by_branch(share(row), turns.partition_point(|&turn| turn < row)),
             };
-            phases_rad = smoothed(rows, (0..rows.len()).map(told).collect());
+            phases_rad = smoothed(rows, &(0..rows.len()).map(reading).collect::<Vec<_>>());
             (floor, height) = floor_and_height(rows, &phases_rad);
         }
         let left = rows.iter().zip(&phases_rad).map(|(row, &phase_rad)| row.power - floor - height * fringe(phase_rad));
@@ -216,14 +216,16 @@ fn fringe(phase_rad: f64) -> f64 {
     (0.5 * phase_rad).sin().powi(2)
 }
 
-/// What a row tells of its phase: the square of `slope`·(φ − `phase_rad`) is what a curve through φ misses.
+/// The phase at a row's level as its power gives it, and how well: a curve that has φ there misses the power by
+/// `slope`·(φ − `phase_rad`), as a share of the fringe's height.
 #[derive(Clone, Copy)]
-struct Told {
+struct PhaseReading {
     phase_rad: f64,
+    /// Of the fringe there, per radian; 0 where the power says nothing of the phase.
     slope: f64,
 }
 
-impl Told {
+impl PhaseReading {
     /// By the arccosine of a share of the light, on the branch from `branch`·π to the next.
     fn by_branch(share: f64, branch: usize) -> Self {
         let rising = (1.0 - 2.0 * share.clamp(0.0, 1.0)).acos();
@@ -234,7 +236,7 @@ impl Told {
     /// By the straight line that touches the fringe at `near_rad`.
     fn near(near_rad: f64, share: f64) -> Self {
         let slope = 0.5 * near_rad.sin();
-        // At a turn it tells nothing; a wild step there would come to nothing, too.
+        // At a turn the power says nothing; a wild step there would come to nothing, too.
         let step_rad = if slope.abs() < 1e-3 { 0.0 } else { (share - fringe(near_rad)) / slope };
         Self { phase_rad: near_rad + step_rad, slope }
     }
@@ -251,38 +253,40 @@ fn floor_and_height(rows: &[LevelPower], phases_rad: &[f64]) -> (f64, f64) {
     (power - height * share, height)
 }
 
-/// A curve through what rows tell, as stiff as lets them foretell each other best; 0 at level 0.
-fn smoothed(rows: &[LevelPower], told: Vec<Told>) -> Vec<f64> {
+/// A curve through the readings of all rows, as stiff as lets them foretell each other best; 0 at level 0.
+fn smoothed(rows: &[LevelPower], readings: &[PhaseReading]) -> Vec<f64> {
     let levels: Vec<f64> = rows.iter().map(|row| f64::from(row.level)).collect();
     let missed = |stiffness: f64| -> f64 {
         let fold = |fold: usize| {
             let is_left_out = |row: usize| row % FOLDS == fold;
-            let silent =
-                |(row, told): (usize, &Told)| if is_left_out(row) { Told { slope: 0.0, ..*told } } else { *told };
-            let kept: Vec<Told> = told.iter().enumerate().map(silent).collect();
+            let weighted = |(row, reading): (usize, &PhaseReading)| {
+                if is_left_out(row) { PhaseReading { slope: 0.0, ..*reading } } else { *reading }
+            };
+            let kept: Vec<_> = readings.iter().enumerate().map(weighted).collect();
             let curve = spline(&levels, &kept, stiffness);
             let left_out = (0..rows.len()).filter(|&row| is_left_out(row));
-            left_out.map(|row| (told[row].slope * (curve[row] - told[row].phase_rad)).powi(2)).sum::<f64>()
+            left_out.map(|row| (readings[row].slope * (curve[row] - readings[row].phase_rad)).powi(2)).sum::<f64>()
         };
         (0..FOLDS).map(fold).sum()
     };
     let best = STIFFNESSES.min_by(|&a, &b| missed(10f64.powi(a)).total_cmp(&missed(10f64.powi(b)))).unwrap_or(0);
     // A liquid crystal's phase never runs back.
-    let mut curves = (best..=*STIFFNESSES.end()).map(|power| spline(&levels, &told, 10f64.powi(power)));
+    let mut curves = (best..=*STIFFNESSES.end()).map(|power| spline(&levels, readings, 10f64.powi(power)));
     let rises = |curve: &Vec<f64>| curve.is_sorted_by(|a, b| a < b);
-    curves.find(rises).unwrap_or_else(|| spline(&levels, &told, 10f64.powi(best)))
+    curves.find(rises).unwrap_or_else(|| spline(&levels, readings, 10f64.powi(best)))
 }
 
-/// The curve that misses least of what rows tell, and whose changes of slope have the least squares, `stiffness` times;
+/// The curve that misses the readings by least, and whose changes of slope have the least squares, `stiffness` times;
 /// with φ = 0 at level 0. A matrix of five diagonals. Slopes are of steps of the mean distance between levels.
-fn spline(levels: &[f64], told: &[Told], stiffness: f64) -> Vec<f64> {
+fn spline(levels: &[f64], readings: &[PhaseReading], stiffness: f64) -> Vec<f64> {
     // Ties level 0 to its phase, and keeps rows without weight solvable.
     const TIE: f64 = 1e9;
     const LEAST: f64 = 1e-9;
     let count = levels.len();
     let step = (levels[count - 1] - levels[0]) / (count - 1) as f64;
-    let mut diagonals: Vec<[f64; 3]> = told.iter().map(|told| [told.slope * told.slope + LEAST, 0.0, 0.0]).collect();
-    let mut right: Vec<f64> = diagonals.iter().zip(told).map(|(diagonal, told)| diagonal[0] * told.phase_rad).collect();
+    let weight = |reading: &PhaseReading| reading.slope * reading.slope + LEAST;
+    let mut diagonals: Vec<[f64; 3]> = readings.iter().map(|reading| [weight(reading), 0.0, 0.0]).collect();
+    let mut right: Vec<f64> = readings.iter().map(|reading| weight(reading) * reading.phase_rad).collect();
     diagonals[0][0] += TIE;
     for row in 1..count - 1 {
         let [before, after] = [row - 1, row].map(|at| step / (levels[at + 1] - levels[at]));
