@@ -223,40 +223,10 @@ impl RefusalWatch {
         let causes: Vec<_> = faults.chain(rejections).filter(|(_, count)| *count > 0).collect();
         let refused: u64 = causes.iter().map(|(_, count)| count).sum();
         let samples = counts.of(Counter::Samples) - before.of(Counter::Samples);
-        let bytes = counts.of(Counter::Bytes) - before.of(Counter::Bytes);
         self.unread.look(now, counts.of(Counter::Bytes));
         let is_unread = samples == 0 && self.unread.is_long(now);
         if refused == 0 {
-            let messages = counts.of(Counter::Notes) - before.of(Counter::Notes);
-            if messages > 0 && samples == 0 {
-                let since = *self.refused_since.get_or_insert(now);
-                let is_long = messages >= LEAST_MESSAGES && now - since >= REFUSED_FOR;
-                let is_known = self.current.as_ref().is_some_and(|current| current.reason == OTHER_MESSAGES);
-                return ((over || is_long) && !is_known).then(|| Refusal {
-                    refused: 0,
-                    reason: OTHER_MESSAGES.into(),
-                    advice: format!(
-                        "{messages} messages came, and none of them is of a pupil: {OTHER_MESSAGES_ADVICE}"
-                    ),
-                });
-            }
-            let is_all = over && before.of(Counter::Accepted) == 0;
-            if bytes > 0 && samples == 0 && (is_unread || is_all) {
-                let is_known = self.current.as_ref().is_some_and(|current| current.reason == UNREAD_BYTES);
-                return (!is_known).then(|| Refusal {
-                    refused: 0,
-                    reason: UNREAD_BYTES.into(),
-                    advice: format!("{bytes} bytes came, and no sample was in them: {FORM_ADVICE}"),
-                });
-            }
-            let unheard = counts.of(Counter::Connects) > 0 && counts.of(Counter::Bytes) == 0;
-            return (unheard && self.current.is_none() && now - self.began >= UNHEARD_FOR).then(|| Refusal {
-                refused: 0,
-                reason: String::new(),
-                advice:
-                    "nothing has been heard of the tracker: is it switched on, and does it send without being asked?"
-                        .into(),
-            });
+            return self.nothing_read(now, counts, before, over);
         }
         let since = *self.refused_since.get_or_insert(now);
         if !over && !is_unread && (now - since < REFUSED_FOR || refused < LEAST_MESSAGES) {
@@ -285,6 +255,43 @@ impl RefusalWatch {
             return None;
         }
         Some(Refusal { refused, reason: cause.name(), advice: self.advice(cause) })
+    }
+
+    /// What stands in the way where nothing was refused: other messages, bytes that are none, or silence.
+    fn nothing_read(
+        &mut self,
+        now: TimeNs,
+        counts: &CounterSnapshot,
+        before: &CounterSnapshot,
+        over: bool,
+    ) -> Option<Refusal> {
+        let since_before = |counter| counts.of(counter) - before.of(counter);
+        let [samples, messages, bytes] = [Counter::Samples, Counter::Notes, Counter::Bytes].map(since_before);
+        let is_known = |reason: &str| self.current.as_ref().is_some_and(|current| current.reason == reason);
+        let is_all = over && before.of(Counter::Accepted) == 0;
+        if messages > 0 && samples == 0 {
+            let since = *self.refused_since.get_or_insert(now);
+            let is_long = messages >= LEAST_MESSAGES && now - since >= REFUSED_FOR;
+            return ((over || is_long) && !is_known(OTHER_MESSAGES)).then(|| Refusal {
+                refused: 0,
+                reason: OTHER_MESSAGES.into(),
+                advice: format!("{messages} messages came, and none of them is of a pupil: {OTHER_MESSAGES_ADVICE}"),
+            });
+        }
+        if bytes > 0 && samples == 0 && (self.unread.is_long(now) || is_all) {
+            return (!is_known(UNREAD_BYTES)).then(|| Refusal {
+                refused: 0,
+                reason: UNREAD_BYTES.into(),
+                advice: format!("{bytes} bytes came, and no sample was in them: {FORM_ADVICE}"),
+            });
+        }
+        let unheard = counts.of(Counter::Connects) > 0 && counts.of(Counter::Bytes) == 0;
+        (unheard && self.current.is_none() && now - self.began >= UNHEARD_FOR).then(|| Refusal {
+            refused: 0,
+            reason: String::new(),
+            advice: "nothing has been heard of the tracker: is it switched on, and does it send without being asked?"
+                .into(),
+        })
     }
 
     fn advice(&self, cause: Cause) -> String {

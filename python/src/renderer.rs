@@ -277,18 +277,7 @@ impl Renderer {
             integers = depth.values::<u16>()?;
             ArrayDepths::MillimetresU16(integers.as_slice()?)
         } else {
-            let of: fn(&[f32]) -> ArrayDepths<'_> = match depth_unit {
-                "metres" => |numbers| ArrayDepths::MetresF32(numbers),
-                "millimetres" => |numbers| ArrayDepths::MillimetresF32(numbers),
-                "dioptres" => |numbers| ArrayDepths::DioptresF32(numbers),
-                "normalised_dioptres" => |numbers| ArrayDepths::NormalisedDioptresF32(numbers),
-                other => {
-                    return Err(InputError::new_err(format!(
-                        "depth_unit: found {other:?}, expected \"metres\", \"millimetres\", \"dioptres\" or \
-                         \"normalised_dioptres\" (0 the far end of the rig's depth range, 1 the near end)"
-                    )));
-                }
-            };
+            let of = depths_in(depth_unit)?;
             if !depth.is::<f32>() {
                 let found = format!("an array of {}", depth.type_name());
                 return Err(depth.refusal(found, "float32, or uint16 with depth_unit=\"millimetres\""));
@@ -306,6 +295,23 @@ impl Renderer {
             InputError::new_err(format!("{name}: {error}{advice}"))
         })
     }
+}
+
+/// How depths of floats in a unit are read.
+fn depths_in(unit: &str) -> PyResult<fn(&[f32]) -> ArrayDepths<'_>> {
+    let of: fn(&[f32]) -> ArrayDepths<'_> = match unit {
+        "metres" => |numbers| ArrayDepths::MetresF32(numbers),
+        "millimetres" => |numbers| ArrayDepths::MillimetresF32(numbers),
+        "dioptres" => |numbers| ArrayDepths::DioptresF32(numbers),
+        "normalised_dioptres" => |numbers| ArrayDepths::NormalisedDioptresF32(numbers),
+        other => {
+            return Err(InputError::new_err(format!(
+                "depth_unit: found {other:?}, expected \"metres\", \"millimetres\", \"dioptres\" or \
+                 \"normalised_dioptres\" (0 the far end of the rig's depth range, 1 the near end)"
+            )));
+        }
+    };
+    Ok(of)
 }
 
 pub(crate) fn backend_named(name: &str) -> PyResult<Backend> {

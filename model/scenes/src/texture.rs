@@ -191,65 +191,20 @@ impl Pattern {
                 blend(a, b, (0.5 + (value - 0.5) * contrast).clamp(0.0, 1.0))
             }
             Self::Dots { ground, mark, cell, radius, presence, seed } => {
-                let (column, row) = ((x / cell).floor() as i32, (y / cell).floor() as i32);
-                if hash_unit(column, row, seed) > presence {
-                    return ground;
-                }
-                let room = (cell - 2.0 * radius).max(0.0);
-                let centre_x = column as f32 * cell + radius + room * hash_unit(column, row, seed ^ 1);
-                let centre_y = row as f32 * cell + radius + room * hash_unit(column, row, seed ^ 2);
-                let inside = (x - centre_x).powi(2) + (y - centre_y).powi(2) < radius * radius;
-                if inside { mark } else { ground }
+                if is_in_dot(x, y, cell, radius, presence, seed) { mark } else { ground }
             }
             Self::Text { ground, mark, height, weight, seed } => {
-                let (unit, line) = (height / 6.0, (y / (height * 1.7)).floor() as i32);
-                let column = (x / (unit * 5.6)).floor() as i32;
-                let letter = match hash(column, line, seed) % 44 {
-                    n @ 0..26 => b'A' + n as u8,
-                    n @ 26..36 => b'0' + (n - 26) as u8,
-                    _ => b' ',
-                };
-                let local_x = (x - column as f32 * unit * 5.6) / unit - 0.8;
-                let local_y = (y - line as f32 * height * 1.7) / unit - 1.6;
-                let inked = glyphs::stroke_distance(letter, local_x, local_y) * unit < 0.5 * weight;
-                if inked { mark } else { ground }
+                if stroke_distance_in_text(x, y, height, seed) < 0.5 * weight { mark } else { ground }
             }
             Self::Words { ground, mark, height, weight, ref lines } => {
-                let (unit, pitch) = (height / 6.0, height * 1.7);
-                let from_top = y + 0.5 * pitch * lines.len() as f32;
-                let line = (from_top / pitch).floor();
-                if line < 0.0 || line >= lines.len() as f32 {
-                    return ground;
-                }
-                let text = lines[line as usize].as_bytes();
-                let from_left = x + 0.5 * unit * 5.6 * text.len() as f32;
-                let column = (from_left / (unit * 5.6)).floor();
-                if column < 0.0 || column >= text.len() as f32 {
-                    return ground;
-                }
-                let local_x = (from_left - column * unit * 5.6) / unit - 0.8;
-                let local_y = (from_top - line * pitch) / unit - 2.1;
-                let inked = glyphs::stroke_distance(text[column as usize], local_x, local_y) * unit < 0.5 * weight;
-                if inked { mark } else { ground }
+                let distance = stroke_distance_in_words(x, y, height, lines);
+                if distance.is_some_and(|distance| distance < 0.5 * weight) { mark } else { ground }
             }
             Self::Polygons { ground, a, b, cell, seed } => {
-                let (column, row) = ((x / cell).floor() as i32, (y / cell).floor() as i32);
-                let random = |salt: u32| hash_unit(column, row, seed ^ salt);
-                if random(1) < 0.3 {
-                    return ground;
-                }
-                let sides = 3 + (random(2) * 3.0) as u32;
-                let inradius = cell * (0.12 + 0.12 * random(3));
-                let turn = std::f32::consts::TAU * random(4);
-                let (dx, dy) = (x - (column as f32 + 0.5) * cell, y - (row as f32 + 0.5) * cell);
-                let inside = (0..sides).all(|side| {
-                    let (sin, cos) = (turn + std::f32::consts::TAU * side as f32 / sides as f32).sin_cos();
-                    dx * cos + dy * sin < inradius
-                });
-                if inside { blend(a, b, random(5)) } else { ground }
+                shade_of_polygon(x, y, cell, seed).map_or(ground, |shade| blend(a, b, shade))
             }
             Self::Ticks { ground, mark, cell, width, seed } => {
-                let (column, row) = ((x / cell).floor() as i32, (y / cell).floor() as i32);
+                let (column, row) = cell_at(x, y, cell);
                 let (sin, cos) = (std::f32::consts::PI * hash_unit(column, row, seed)).sin_cos();
                 let (dx, dy) = (x - (column as f32 + 0.5) * cell, y - (row as f32 + 0.5) * cell);
                 let inside = (dx * sin - dy * cos).abs() < 0.5 * width && (dx * cos + dy * sin).abs() < 0.38 * cell;
@@ -280,17 +235,9 @@ impl Pattern {
                 blend(band(x), band(y), 0.5)
             }
             Self::Mosaic { cell, saturation, seed } => {
-                let (column, row) = ((x / cell).floor() as i32, (y / cell).floor() as i32);
-                let (mut nearest, mut owner) = (f32::INFINITY, (0, 0));
-                for (c, r) in (-1..=1).flat_map(|dr| (-1..=1).map(move |dc| (column + dc, row + dr))) {
-                    let px = (c as f32 + hash_unit(c, r, seed)) * cell - x;
-                    let py = (r as f32 + hash_unit(c, r, seed ^ 1)) * cell - y;
-                    if px * px + py * py < nearest {
-                        (nearest, owner) = (px * px + py * py, (c, r));
-                    }
-                }
-                let bright = 0.15 + 0.85 * hash_unit(owner.0, owner.1, seed ^ 2);
-                let vivid = |salt| 1.0 - saturation * hash_unit(owner.0, owner.1, seed ^ salt);
+                let (column, row) = nearest_point(x, y, cell, seed);
+                let bright = 0.15 + 0.85 * hash_unit(column, row, seed ^ 2);
+                let vivid = |salt| 1.0 - saturation * hash_unit(column, row, seed ^ salt);
                 [bright * vivid(3), bright * vivid(4), bright * vivid(5)]
             }
             Self::Natural { mean, tint, contrast, chroma, seed } => {
@@ -301,32 +248,7 @@ impl Pattern {
                 std::array::from_fn(|c| (luminance * tint[c] * balance[c]).clamp(0.0, 1.0))
             }
             Self::DeadLeaves { hue, saturation, largest, seed } => {
-                // Each size has a lattice of its own with one leaf in each cell; the leaf with the highest number is on
-                // top. A leaf is no wider than a cell, so that of each size only four can be here.
-                let (mut highest, mut colour) = (-1.0, hue.map(|c| 0.3 * c));
-                let mut diameter = largest;
-                let mut salt = seed;
-                while diameter > 2.0 {
-                    let (column, row) = ((x / diameter - 0.5).floor() as i32, (y / diameter - 0.5).floor() as i32);
-                    for (c, r) in [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dc, dr)| (column + dc, row + dr)) {
-                        let bits = hash(c, r, salt);
-                        let part = |shift: u32| ((bits >> shift) & 0xff) as f32 / 255.0;
-                        let radius = 0.5 * diameter * (0.55 + 0.15 * part(0));
-                        let room = diameter - 2.0 * radius;
-                        let centre_x = c as f32 * diameter + radius + room * part(8) - x;
-                        let centre_y = r as f32 * diameter + radius + room * part(16) - y;
-                        let height = hash_unit(c, r, salt ^ 0x35);
-                        if height > highest && centre_x * centre_x + centre_y * centre_y < radius * radius {
-                            highest = height;
-                            let bright = 0.03 + 0.9 * part(24) * part(24);
-                            let tone = |salt_of: u32| 1.0 - saturation * hash_unit(c, r, salt ^ salt_of);
-                            colour = [bright * tone(1), bright * tone(2), bright * tone(3)];
-                        }
-                    }
-                    diameter /= 1.7;
-                    salt = salt.wrapping_add(0x9e37);
-                }
-                colour
+                highest_leaf(x, y, saturation, largest, seed).unwrap_or(hue.map(|c| 0.3 * c))
             }
             Self::Spectral { a, b, ref waves } => {
                 let sum: f32 = waves.iter().map(|w| w.amplitude * (w.kx * x + w.ky * y + w.phase).cos()).sum();
@@ -352,6 +274,118 @@ impl Pattern {
             }
         }
     }
+}
+
+/// Column and row of the square cell around a point.
+fn cell_at(x: f32, y: f32, cell: f32) -> (i32, i32) {
+    ((x / cell).floor() as i32, (y / cell).floor() as i32)
+}
+
+/// Whether a point is in the dot of its cell, which this share of all cells have.
+fn is_in_dot(x: f32, y: f32, cell: f32, radius: f32, presence: f32, seed: u32) -> bool {
+    let (column, row) = cell_at(x, y, cell);
+    if hash_unit(column, row, seed) > presence {
+        return false;
+    }
+    let room = (cell - 2.0 * radius).max(0.0);
+    let centre_x = column as f32 * cell + radius + room * hash_unit(column, row, seed ^ 1);
+    let centre_y = row as f32 * cell + radius + room * hash_unit(column, row, seed ^ 2);
+    (x - centre_x).powi(2) + (y - centre_y).powi(2) < radius * radius
+}
+
+/// Pixels from a point to the nearest stroke of its letter, in lines of random ones that are `height` high.
+fn stroke_distance_in_text(x: f32, y: f32, height: f32, seed: u32) -> f32 {
+    let (unit, line) = (height / 6.0, (y / (height * 1.7)).floor() as i32);
+    let column = (x / (unit * 5.6)).floor() as i32;
+    let letter = match hash(column, line, seed) % 44 {
+        n @ 0..26 => b'A' + n as u8,
+        n @ 26..36 => b'0' + (n - 26) as u8,
+        _ => b' ',
+    };
+    let local_x = (x - column as f32 * unit * 5.6) / unit - 0.8;
+    let local_y = (y - line as f32 * height * 1.7) / unit - 1.6;
+    glyphs::stroke_distance(letter, local_x, local_y) * unit
+}
+
+/// The same in these lines, centred on the origin; none around them.
+fn stroke_distance_in_words(x: f32, y: f32, height: f32, lines: &[&'static str]) -> Option<f32> {
+    let (unit, pitch) = (height / 6.0, height * 1.7);
+    let from_top = y + 0.5 * pitch * lines.len() as f32;
+    let line = (from_top / pitch).floor();
+    if line < 0.0 || line >= lines.len() as f32 {
+        return None;
+    }
+    let text = lines[line as usize].as_bytes();
+    let from_left = x + 0.5 * unit * 5.6 * text.len() as f32;
+    let column = (from_left / (unit * 5.6)).floor();
+    if column < 0.0 || column >= text.len() as f32 {
+        return None;
+    }
+    let local_x = (from_left - column * unit * 5.6) / unit - 0.8;
+    let local_y = (from_top - line * pitch) / unit - 2.1;
+    Some(glyphs::stroke_distance(text[column as usize], local_x, local_y) * unit)
+}
+
+/// The shade, 0 to 1, of the polygon of its cell that a point is in, if it is in one.
+fn shade_of_polygon(x: f32, y: f32, cell: f32, seed: u32) -> Option<f32> {
+    let (column, row) = cell_at(x, y, cell);
+    let random = |salt: u32| hash_unit(column, row, seed ^ salt);
+    if random(1) < 0.3 {
+        return None;
+    }
+    let sides = 3 + (random(2) * 3.0) as u32;
+    let inradius = cell * (0.12 + 0.12 * random(3));
+    let turn = std::f32::consts::TAU * random(4);
+    let (dx, dy) = (x - (column as f32 + 0.5) * cell, y - (row as f32 + 0.5) * cell);
+    let inside = (0..sides).all(|side| {
+        let (sin, cos) = (turn + std::f32::consts::TAU * side as f32 / sides as f32).sin_cos();
+        dx * cos + dy * sin < inradius
+    });
+    inside.then(|| random(5))
+}
+
+/// The cell that holds the nearest of points that are scattered one to a cell.
+fn nearest_point(x: f32, y: f32, cell: f32, seed: u32) -> (i32, i32) {
+    let (column, row) = cell_at(x, y, cell);
+    let (mut nearest, mut owner) = (f32::INFINITY, (0, 0));
+    for (c, r) in (-1..=1).flat_map(|dr| (-1..=1).map(move |dc| (column + dc, row + dr))) {
+        let px = (c as f32 + hash_unit(c, r, seed)) * cell - x;
+        let py = (r as f32 + hash_unit(c, r, seed ^ 1)) * cell - y;
+        if px * px + py * py < nearest {
+            (nearest, owner) = (px * px + py * py, (c, r));
+        }
+    }
+    owner
+}
+
+/// The colour of the topmost leaf at a point, if there is one. Each size of leaves has a lattice of its own with one in
+/// each cell; the leaf with the highest number is on top. A leaf is no wider than a cell, so that of each size only four
+/// can be here.
+fn highest_leaf(x: f32, y: f32, saturation: f32, largest: f32, seed: u32) -> Option<Rgb> {
+    let (mut highest, mut colour) = (-1.0, None);
+    let mut diameter = largest;
+    let mut salt = seed;
+    while diameter > 2.0 {
+        let (column, row) = ((x / diameter - 0.5).floor() as i32, (y / diameter - 0.5).floor() as i32);
+        for (c, r) in [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dc, dr)| (column + dc, row + dr)) {
+            let bits = hash(c, r, salt);
+            let part = |shift: u32| ((bits >> shift) & 0xff) as f32 / 255.0;
+            let radius = 0.5 * diameter * (0.55 + 0.15 * part(0));
+            let room = diameter - 2.0 * radius;
+            let centre_x = c as f32 * diameter + radius + room * part(8) - x;
+            let centre_y = r as f32 * diameter + radius + room * part(16) - y;
+            let height = hash_unit(c, r, salt ^ 0x35);
+            if height > highest && centre_x * centre_x + centre_y * centre_y < radius * radius {
+                highest = height;
+                let bright = 0.03 + 0.9 * part(24) * part(24);
+                let tone = |salt_of: u32| 1.0 - saturation * hash_unit(c, r, salt ^ salt_of);
+                colour = Some([bright * tone(1), bright * tone(2), bright * tone(3)]);
+            }
+        }
+        diameter /= 1.7;
+        salt = salt.wrapping_add(0x9e37);
+    }
+    colour
 }
 
 /// Value noise in 0..1, the sum of `octaves` of it, each at twice the frequency and 0.55 of the amplitude.

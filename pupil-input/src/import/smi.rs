@@ -13,7 +13,7 @@ use super::input::LogInput;
 use super::parts::is_restart;
 use super::recording::{LogBuilder, LogSample};
 use super::rows::Blink;
-use super::text::{Header, Picker, number, positive_size, time};
+use super::text::{Header, Lines, Picker, number, positive_size, time};
 use crate::SampleEye;
 use crate::cells::separator;
 use crate::size_unit::SizeUnit;
@@ -64,41 +64,63 @@ fn recognises(input: &LogInput<'_>) -> bool {
     input.head_lines().find(|line| line[0] != b'#').is_some_and(|line| header_of(line).is_some())
 }
 
-fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
-    let mut lines = input.lines()?;
+/// Where one eye's size is: a diameter, or the width and the height of the pupil's picture.
+struct SizeColumns {
+    size: Option<usize>,
+    height: Option<usize>,
+}
+
+impl SizeColumns {
+    fn of(header: &Header, names: &Names, in_mm: bool) -> Self {
+        if in_mm {
+            Self { size: header.first_of(&names.diameter_mm), height: None }
+        } else {
+            Self { size: header.first_of(&names.width_px), height: header.first_of(&names.height_px) }
+        }
+    }
+
+    /// The diameter that the cells of a row give; nothing of an eye without a column.
+    fn diameter(&self, size: Option<&[u8]>, height: Option<&[u8]>) -> Option<Result<f64, LogFault>> {
+        self.size?;
+        Some(figure(size).and_then(|size| match self.height {
+            None => Ok(size),
+            // The disc of the area of the ellipse.
+            Some(_) => figure(height).map(|height| (size * height).sqrt()),
+        }))
+    }
+}
+
+/// Reads up to the names of the columns; with the number of samples that the lines before them promise.
+fn read_head(lines: &mut Lines, log: &mut LogBuilder) -> Option<(Header, Option<f64>)> {
     let mut stated_samples = None;
-    let header = loop {
-        let Some(line) = lines.next(log) else { return Ok(()) };
+    loop {
+        let line = lines.next(log)?;
         let text = line.bytes.trim_ascii();
         if let Some(rate_hz) = stated(text, b"Sample Rate").filter(|rate_hz| (1.0..=1e5).contains(rate_hz)) {
             log.stated_rate_hz.get_or_insert(rate_hz);
         }
         stated_samples = stated_samples.or_else(|| stated(text, b"Number of Samples"));
         if !text.is_empty() && text[0] != b'#' {
-            match header_of(text) {
-                Some(header) => break header,
-                None => return Ok(()),
-            }
+            return header_of(text).map(|header| (header, stated_samples));
         }
-    };
+    }
+}
+
+fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let mut lines = input.lines()?;
+    let Some((header, stated_samples)) = read_head(&mut lines, log) else { return Ok(()) };
     let Some((time_column, places)) = times(&header) else { return Ok(()) };
     let in_mm = EYES.iter().any(|eye| header.first_of(&eye.diameter_mm).is_some());
-    let [left, right] = EYES.map(|eye| {
-        if in_mm {
-            (header.first_of(&eye.diameter_mm), None)
-        } else {
-            (header.first_of(&eye.width_px), header.first_of(&eye.height_px))
-        }
-    });
+    let [left, right] = EYES.map(|eye| SizeColumns::of(&header, &eye, in_mm));
     let [left_event, right_event] = EYES.map(|eye| header.first_of(&eye.event));
     let columns = [
         Some(time_column),
         header.column("Type"),
         header.column("Participant"),
-        left.0,
-        left.1,
-        right.0,
-        right.1,
+        left.size,
+        left.height,
+        right.size,
+        right.height,
         left_event,
         right_event,
     ];
@@ -139,17 +161,11 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
             log.count(LogFault::BadNumber);
             continue;
         };
-        let sizes = [(left.0, left_size, left.1, left_height), (right.0, right_size, right.1, right_height)];
-        for ((column, size, height_column, height), names) in sizes.into_iter().zip(&EYES) {
-            if column.is_none() {
-                continue;
+        let diameters = [left.diameter(left_size, left_height), right.diameter(right_size, right_height)];
+        for (diameter, names) in diameters.into_iter().zip(&EYES) {
+            if let Some(diameter) = diameter {
+                log.push_sized(diameter, LogSample::lost(t, names.eye), line.number);
             }
-            let diameter = figure(size).and_then(|width| match height_column {
-                None => Ok(width),
-                // The disc of the area of the ellipse.
-                Some(_) => figure(height).map(|height| (width * height).sqrt()),
-            });
-            log.push_sized(diameter, LogSample::lost(t, names.eye), line.number);
         }
         for ((shut, event), names) in blinks.iter_mut().zip([left_event, right_event]).zip(&EYES) {
             shut.note(t, event == Some(b"Blink"), names.eye, log);

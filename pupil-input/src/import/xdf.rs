@@ -341,6 +341,61 @@ impl Stream {
         })
     }
 
+    /// Its name and type, for notes.
+    fn described(&self) -> String {
+        format!("`{}` of type `{}`", self.name.escape_debug(), self.kind.escape_debug())
+    }
+
+    /// Takes the first size in `unit` of each eye that is not `known`: the eyes taken so far, each with its stream.
+    fn take_sizes(&mut self, id: u32, unit: SizeUnit, known: &mut Vec<(SampleEye, u32)>, log: &mut LogBuilder) {
+        let sizes = self.channels.iter().enumerate().filter_map(|(index, channel)| match channel {
+            Channel::Size { eye, unit: of, .. } if of.unit == unit && self.figure != Figure::Text => {
+                Some((*eye, index))
+            }
+            _ => None,
+        });
+        let (mut doubts, mut doubles) = (Vec::new(), Vec::new());
+        for (eye, size) in sizes {
+            let Channel::Size { label, measure, doubt, .. } = &self.channels[size] else { continue };
+            let label = label.escape_debug().to_string();
+            // Both eyes in one figure add nothing to an eye's own, and the other way round.
+            let again = known
+                .iter()
+                .any(|&(of, by)| of == eye || by != id && (of == SampleEye::Both || eye == SampleEye::Both));
+            if again {
+                if known.contains(&(eye, id)) {
+                    doubles.push((eye, label));
+                }
+                continue;
+            }
+            if let Some(doubt) = doubt {
+                doubts.push((label, measure.plural(), *doubt));
+            }
+            known.push((eye, id));
+            let confidence = |wanted| {
+                self.channels
+                    .iter()
+                    .position(|channel| matches!(channel, Channel::Confidence { eye, .. } if *eye == wanted))
+            };
+            self.taken.push((eye, size, confidence(eye).or_else(|| confidence(SampleEye::Both))));
+        }
+        for (label, what, doubt) in doubts {
+            log.warn(format!(
+                "the channel `{label}` of {} is taken for {what}, though {doubt}; where it is not, let its sender give it a \
+                 label that says diameter or area, or a unit such as mm^2",
+                self.described()
+            ));
+        }
+        for (eye, label) in doubles {
+            let found = format!("the channel `{label}` of {} was left out: another one is of the", self.described());
+            match eye {
+                // Which of the two eyes each is, no label says.
+                SampleEye::Both => log.warn(format!("{found} pupil, too, and neither says of which eye it is")),
+                eye => log.note(format!("{found} {eye} eye, too")),
+            }
+        }
+    }
+
     /// Streams of pupils alone come before those of gaze, which pair eyes and repeat pupils.
     fn rank(&self) -> usize {
         let name = self.name.to_lowercase();
@@ -418,20 +473,19 @@ fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(
                 .iter()
                 .any(|channel| matches!(channel, Channel::Size { unit, .. } if unit.unit == wanted))
     };
-    let told = |stream: &Stream| format!("`{}` of type `{}`", stream.name.escape_debug(), stream.kind.escape_debug());
     for stream in streams.values() {
         for channel in &stream.channels {
             if let Channel::Contradiction { label } = channel {
                 log.warn(format!(
                     "the channel `{}` of the stream {} is left out: by its label it is a length, and its unit is one of area",
                     label.escape_debug(),
-                    told(stream)
+                    stream.described()
                 ));
             }
         }
     }
     let Some(unit) = units.into_iter().find(|unit| streams.values().any(|stream| has(stream, *unit))) else {
-        let names: Vec<_> = streams.values().take(20).map(told).collect();
+        let names: Vec<_> = streams.values().take(20).map(Stream::described).collect();
         return Err(format!("no pupil among {} streams ({})", streams.len(), names.join(", ")));
     };
     log.unit = unit;
@@ -440,58 +494,12 @@ fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(
     let (mut known, mut left_out) = (Vec::new(), Vec::new());
     for id in order {
         let Some(stream) = streams.get_mut(&id) else { continue };
-        let sizes = stream.channels.iter().enumerate().filter_map(|(index, channel)| match channel {
-            Channel::Size { eye, unit: of, .. } if of.unit == unit && stream.figure != Figure::Text => {
-                Some((*eye, index))
-            }
-            _ => None,
-        });
-        let (mut doubts, mut doubles) = (Vec::new(), Vec::new());
-        for (eye, size) in sizes {
-            let Channel::Size { label, measure, doubt, .. } = &stream.channels[size] else { continue };
-            let label = label.escape_debug().to_string();
-            // Both eyes in one figure add nothing to an eye's own, and the other way round.
-            let again = known
-                .iter()
-                .any(|&(of, by)| of == eye || by != id && (of == SampleEye::Both || eye == SampleEye::Both));
-            if again {
-                if known.contains(&(eye, id)) {
-                    doubles.push((eye, label));
-                }
-                continue;
-            }
-            if let Some(doubt) = doubt {
-                doubts.push((label, measure.plural(), *doubt));
-            }
-            known.push((eye, id));
-            let confidence = |wanted| {
-                stream
-                    .channels
-                    .iter()
-                    .position(|channel| matches!(channel, Channel::Confidence { eye, .. } if *eye == wanted))
-            };
-            stream.taken.push((eye, size, confidence(eye).or_else(|| confidence(SampleEye::Both))));
-        }
-        for (label, what, doubt) in doubts {
-            log.warn(format!(
-                "the channel `{label}` of {} is taken for {what}, though {doubt}; where it is not, let its sender give it a \
-                 label that says diameter or area, or a unit such as mm^2",
-                told(stream)
-            ));
-        }
-        for (eye, label) in doubles {
-            let told = format!("the channel `{label}` of {} was left out: another one is of the", told(stream));
-            match eye {
-                // Which of the two eyes each is, no label says.
-                SampleEye::Both => log.warn(format!("{told} pupil, too, and neither says of which eye it is")),
-                eye => log.note(format!("{told} {eye} eye, too")),
-            }
-        }
+        stream.take_sizes(id, unit, &mut known, log);
         if stream.taken.is_empty() {
-            left_out.push(told(stream));
+            left_out.push(stream.described());
         } else {
             let eyes: Vec<_> = stream.taken.iter().map(|taken| taken.0.to_string()).collect();
-            log.note(format!("read from the stream {}: {}", told(stream), eyes.join(", ")));
+            log.note(format!("read from the stream {}: {}", stream.described(), eyes.join(", ")));
             if stream.rate_hz > 0.0 {
                 log.stated_rate_hz.get_or_insert(stream.rate_hz);
             }
