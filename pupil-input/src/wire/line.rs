@@ -138,11 +138,8 @@ fn later_sample(line: &[u8]) -> Option<LineSample> {
     parse_line(&line[start..]).ok()
 }
 
-/// Reads one line without its ending.
-///
-/// # Errors
-/// The first reason why it is not a sample.
-pub fn parse_line(line: &[u8]) -> Result<LineSample, WireFault> {
+/// One line without its ending, or the first reason why it is not a sample.
+fn parse_line(line: &[u8]) -> Result<LineSample, WireFault> {
     match read_line(line)? {
         (sample, None) => Ok(sample),
         (_, Some(fault)) => Err(fault),

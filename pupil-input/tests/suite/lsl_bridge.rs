@@ -5,8 +5,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use holod_pupil_input::SampleEye::{Both, Left, Right};
-use holod_pupil_input::wire::WireSample;
-use holod_pupil_input::wire::line::parse_line;
+use holod_pupil_input::wire::line::LineDecoder;
+use holod_pupil_input::wire::{Decoder, WireEvent, WireSample};
 use tempfile::TempDir;
 
 const PAGE: &str = include_str!("../../doc/lab-streaming-layer.md");
@@ -72,14 +72,17 @@ fn bridged(channels: &str, samples: &str) -> Vec<WireSample> {
     // The end, by a line that the bridge does not send.
     let end = UdpSocket::bind("127.0.0.1:0").expect("a port");
     end.send_to(b"end", socket.local_addr().expect("an address")).expect("sends");
-    let mut lines = Vec::new();
+    let (mut decoder, mut samples) = (LineDecoder::new(), Vec::new());
     let mut bytes = [0; 256];
     loop {
         let count = socket.recv(&mut bytes).expect("a datagram");
-        match bytes[..count].strip_suffix(b"\n") {
-            Some(line) => lines.push(WireSample::from(parse_line(line).expect("a line of the protocol"))),
-            None => return lines,
+        if !bytes[..count].ends_with(b"\n") {
+            return samples;
         }
+        decoder.push(&bytes[..count], &mut |event| match event {
+            WireEvent::Sample(sample) => samples.push(sample),
+            other => panic!("{other:?} for a line of the protocol"),
+        });
     }
 }
 
