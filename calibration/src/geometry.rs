@@ -12,11 +12,11 @@ use crate::{Dioptres, Metres, PerColour, PupilDiameter, Resolution};
 /// eye sees what it would see of the panel itself through an eyepiece of f/M, so that is the focal length here.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DisplayGeometry {
-    /// Panel pixels.
+    /// Columns and rows of panel pixels, without the margins of the video frame.
     pub resolution: Resolution,
     /// Distance between the centres of neighbouring pixels.
     pub pixel_pitch: Metres,
-    /// Laser wavelengths.
+    /// Wavelength of each colour's laser.
     pub wavelengths: PerColour<Metres>,
     /// Focal length of the eyepiece, over the magnification of the relay before it.
     pub eyepiece_focal_length: Metres,

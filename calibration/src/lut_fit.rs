@@ -31,9 +31,9 @@ const FOLDS: usize = 5;
 /// The power of a first order while lines of level 0 and of this level are shown, in any unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LevelPower {
-    /// The level.
+    /// The level of the lines between those of level 0.
     pub level: u16,
-    /// The power.
+    /// Optical power in the order, in a unit that is the same for all levels of a sweep.
     pub power: f64,
 }
 
@@ -54,7 +54,7 @@ pub struct LutFit {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum LutFitError {
-    /// Too few rows.
+    /// Fewer rows than [`ROWS_MIN`].
     #[error("found {found} rows, expected {ROWS_MIN} at least: measure more levels")]
     Rows { found: usize },
     /// The table would have to be guessed at one end.

@@ -1,4 +1,4 @@
-//! How many bits the greys of a PNG have: decoders stretch fewer than 8 to 8, and tell of none.
+//! How many bits the greys of a PNG have: decoders stretch fewer than 8 to 8, and do not say so.
 
 use std::io::{self, Read};
 

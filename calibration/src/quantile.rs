@@ -27,7 +27,7 @@ impl Sorted {
         self.quantile(0.5)
     }
 
-    /// The largest.
+    /// The largest value; NaN where one of them is.
     pub fn max(&self) -> f64 {
         self.quantile(1.0)
     }

@@ -77,12 +77,12 @@ impl Sub for TimeNs {
 pub struct Resolution {
     /// Pixels in a row.
     pub width: usize,
-    /// Rows.
+    /// Pixels in a column.
     pub height: usize,
 }
 
 impl Resolution {
-    /// Pixels in all.
+    /// The number of pixels, width times height.
     pub const fn pixels(self) -> usize {
         self.width * self.height
     }
@@ -98,11 +98,11 @@ impl fmt::Display for Resolution {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Colour {
-    /// The longest wavelength.
+    /// The colour of the longest wavelength; the first in arrays of three.
     Red,
-    /// The middle wavelength.
+    /// The colour of the middle wavelength.
     Green,
-    /// The shortest wavelength.
+    /// The colour of the shortest wavelength.
     Blue,
 }
 

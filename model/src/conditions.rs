@@ -97,7 +97,7 @@ pub enum BenchFit {
 /// Colours whose diffraction over the depth range lies outside what a network was trained for.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OutsideTraining {
-    /// At least one.
+    /// These colours, one at least, each with its diffraction F, px².
     pub found_px2: Vec<(Colour, f64)>,
     /// The least and the most that were trained.
     pub trained_px2: [f64; 2],

@@ -46,7 +46,7 @@ pub struct StoredHologram {
 /// Which rig a hologram was made with.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum RigHash {
-    /// The built-in one.
+    /// The built-in bench, which has no file.
     BuiltIn,
     /// That of a file, whose text has this hash in hexadecimal digits.
     File(String),
@@ -87,7 +87,7 @@ impl fmt::Display for RigHash {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BenchOptics {
-    /// Red, green, blue.
+    /// Wavelengths of the red, the green and the blue laser, nanometres.
     pub wavelengths_nm: [f64; 3],
     /// Distance between the centres of neighbouring pixels.
     pub pixel_pitch_um: f64,

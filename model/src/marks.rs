@@ -9,7 +9,7 @@ use crate::neighbourhood::any_within;
 
 /// Marks are faint at the edges of their discs; black is exactly 0.
 const LEAST_LIGHT: f32 = 1e-6;
-/// Light within so many pixels, each way, is that of a mark.
+/// Light within this many pixels, each way, is that of a mark.
 const AWAY_PX: usize = 16;
 /// Fewer pixels tell nothing.
 const FEWEST_PX: usize = 256;

@@ -25,7 +25,7 @@ const NO_CHANGE: f64 = 1e-12;
 pub struct Part<'a> {
     /// These colours, at least one.
     pub colours: &'a [Colour],
-    /// Without so many pixels at each edge.
+    /// Pixels at each edge that are left out.
     pub border_px: usize,
 }
 

@@ -5,14 +5,14 @@ use holod_calibration::{Colour, Resolution};
 /// A picture in linear light: pixels [3, height, width], white = 1, colours in the order red, green, blue.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LinearImage {
-    /// Width and height.
+    /// Columns and rows of one colour.
     pub resolution: Resolution,
     /// Intensities, row-major within each colour.
     pub pixels: Vec<f32>,
 }
 
 impl LinearImage {
-    /// A black picture.
+    /// A picture without light: 0 in every colour.
     pub fn black(resolution: Resolution) -> Self {
         Self { resolution, pixels: vec![0.0; 3 * resolution.pixels()] }
     }

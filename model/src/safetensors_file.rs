@@ -8,11 +8,11 @@ use serde_json::{Value, json};
 
 /// A tensor on its way into a file.
 pub struct Tensor<'a> {
-    /// Its name.
+    /// Its key in the file's header.
     pub name: String,
     /// What its values are.
     pub dtype: Dtype,
-    /// Its dimensions.
+    /// Its length along each dimension, the outermost first.
     pub shape: Vec<usize>,
     /// Its values, little endian.
     pub bytes: &'a [u8],

@@ -32,7 +32,7 @@ const PUPILS_MM: std::ops::RangeInclusive<f64> = 0.1..=100.0;
 /// What a random scene is for. The kinds never share a scene: each has a seed space of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SceneKind {
-    /// For training.
+    /// For training, with none of the textures and ranges that [`Self::Test`] has for itself.
     Train,
     /// For testing: families of textures, and ranges, that no training scene has.
     Test,
@@ -56,7 +56,7 @@ impl SceneKind {
     }
 }
 
-/// What [`SceneKind::Marks`] are.
+/// What is bright on the black ground of a scene of [`SceneKind::Marks`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Marks {
     /// Discs, from a pixel to nine.
@@ -68,7 +68,7 @@ pub enum Marks {
 }
 
 impl Marks {
-    /// Every kind.
+    /// Every kind, in the order in which scenes take turns.
     pub const ALL: [Self; 3] = [Self::Dots, Self::Lines, Self::Stars];
 
     /// Those of the scene with this number.
@@ -229,7 +229,7 @@ impl SceneShard {
         })
     }
 
-    /// The file.
+    /// Where the shard lies.
     pub fn path(&self) -> &Path {
         &self.path
     }

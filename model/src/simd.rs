@@ -46,14 +46,14 @@ pub(crate) trait Simd: Copy + Send + Sync {
     #[inline(always)]
     fn read(self, from: &[f32]) -> Self::Vector {
         assert!(from.len() >= Self::LANES);
-        // SAFETY: so many are readable.
+        // SAFETY: this many are readable.
         unsafe { self.load(from.as_ptr()) }
     }
     /// Writes the first `LANES` values.
     #[inline(always)]
     fn write(self, to: &mut [f32], vector: Self::Vector) {
         assert!(to.len() >= Self::LANES);
-        // SAFETY: so many are writable.
+        // SAFETY: this many are writable.
         unsafe { self.store(to.as_mut_ptr(), vector) }
     }
     /// a·b + c
@@ -325,7 +325,7 @@ impl Products {
     }
 }
 
-/// Lanes in plain Rust, with so many factors in a word; four are what every compiler target has base vectors for.
+/// `N` lanes in plain Rust, with `FACTORS` factors in a word; four are what every compiler target has base vectors for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Portable<const N: usize, const FACTORS: usize = 1, const INTEGERS: bool = false>;
 

@@ -18,7 +18,7 @@ use tempfile::TempDir;
 
 const INTERVAL: Duration = Duration::from_millis(1);
 const SAMPLES: u64 = 10_000;
-/// Of which so many are not counted: caches and the clock model are cold.
+/// The first of them, which are not counted: caches and the clock model are cold.
 const WARM_UP: u64 = 1000;
 
 fn line(sequence: u64) -> (String, f32) {

@@ -59,7 +59,7 @@ pub(crate) fn has_fewer(line: &[u8], separator: u8, columns: usize) -> bool {
 
 /// Whether a cell behind the first `columns` of a line holds anything.
 pub(crate) fn has_more(line: &[u8], separator: u8, columns: usize) -> bool {
-    // Most lines have not so many separators, within quotes or not.
+    // Most lines have fewer separators, within quotes or not.
     memchr::memchr_iter(separator, line).nth(columns.saturating_sub(1)).is_some()
         && cells(line, separator).skip(columns).any(|cell| !cell.is_empty())
 }

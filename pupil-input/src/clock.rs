@@ -23,7 +23,7 @@ use holod_calibration::TimeNs;
 
 const BUCKETS: usize = 64;
 const BUCKET: TimeNs = TimeNs(250_000_000);
-/// Of so many buckets, the newest, the least decides the height: a second.
+/// The least of this many buckets, the newest, decides the height: a second.
 const RECENT: usize = 4;
 /// Less time than this tells nothing of the slope.
 const SLOPE_SPAN_NS: f64 = 0.5e9;
@@ -43,7 +43,7 @@ pub(crate) const RESTART: TimeNs = TimeNs(1_000_000_000);
 const LONGEST_DELAY: TimeNs = RESTART;
 /// Strays agree when their offsets differ by less.
 const AGREEMENT: TimeNs = TimeNs(50_000_000);
-/// So many strays that agree are a step forward or a restart.
+/// This many strays that agree are a step forward or a restart.
 const AGREEING: u32 = 3;
 /// For so long there must have been agreeing strays only, to tell a clock set back from overtaken samples.
 const SET_BACK_LASTS: TimeNs = TimeNs(100_000_000);

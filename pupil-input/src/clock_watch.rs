@@ -9,9 +9,9 @@ use crate::counters::{Counter, CounterSnapshot};
 const ODD_DRIFT_PPM: f64 = 20_000.0;
 /// For so long the drift must have been so large.
 const ODD_FOR: TimeNs = TimeNs(5_000_000_000);
-/// So many resets within so long a time are no accidents.
+/// This many resets, and within how long a time, are no accidents.
 const MANY_RESETS: u64 = 3;
-/// And so many leaps; a stream begins with one or two.
+/// And this many leaps; a stream begins with one or two.
 const MANY_LEAPS: u64 = 10;
 const COUNTED_WITHIN: TimeNs = TimeNs(10_000_000_000);
 

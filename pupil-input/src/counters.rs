@@ -11,7 +11,7 @@ crate::named::named! {
     pub enum Counter {
         /// Bytes read from a port.
         Bytes = "bytes",
-        /// Samples decoded.
+        /// Samples that were decoded, each eye for itself, before the gate judges them.
         Samples = "samples",
         /// Samples that the gate believed.
         Accepted = "accepted",
@@ -134,7 +134,7 @@ impl CounterSnapshot {
         }
     }
 
-    /// One count.
+    /// How often this was counted since the tracker was started.
     pub const fn of(&self, counter: Counter) -> u64 {
         self.counts[counter as usize]
     }

@@ -83,7 +83,7 @@ impl From<&rig::Tracker> for EstimatorSettings {
 pub enum PupilState {
     /// The slide from the fallback to fresh samples, farther than a tenth of a millimetre from them.
     Acquiring,
-    /// Fresh samples.
+    /// Fresh samples that were believed, as the filter has them.
     Tracking,
     /// The last good value, through a blink or a short loss.
     Holding,
@@ -92,7 +92,7 @@ pub enum PupilState {
 }
 
 impl PupilState {
-    /// Every state.
+    /// Every state, in the order of the enum.
     pub const ALL: [Self; 4] = [Self::Acquiring, Self::Tracking, Self::Holding, Self::Fallback];
 
     /// The name used in records.

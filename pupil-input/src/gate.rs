@@ -27,7 +27,7 @@ pub struct GateSettings {
     pub least_mm: f32,
     /// Greatest diameter of a human pupil.
     pub greatest_mm: f32,
-    /// Least confidence.
+    /// Confidence, 0..=1, that a sample must have at least.
     pub least_confidence: f32,
     /// Lids this far apart are open, however wide the eye opens them at other times.
     pub open_aperture_mm: f32,
@@ -104,9 +104,9 @@ crate::named::named! {
 /// What the gate says of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// Believed.
+    /// It reaches the filter.
     Accepted,
-    /// Not believed.
+    /// It is left out, for this reason.
     Rejected(Rejection),
 }
 

@@ -14,7 +14,7 @@ use crate::{PupilSample, SampleEye};
 
 /// For so long everything must have been refused before it is said.
 const REFUSED_FOR: TimeNs = TimeNs(1_000_000_000);
-/// So many messages at least.
+/// As many messages, refused or of no pupil, must have come before it is said.
 const LEAST_MESSAGES: u64 = 5;
 /// For so long a tracker may say nothing at all before that is said.
 const UNHEARD_FOR: TimeNs = TimeNs(1_800_000_000);
@@ -67,7 +67,7 @@ impl fmt::Display for Refusal {
 /// What has changed since the last look.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum RefusalChange {
-    /// Everything is refused.
+    /// No sample is believed any more, or none ever was, for this reason.
     Refused(Refusal),
     /// A sample was believed after everything had been refused.
     Believed,

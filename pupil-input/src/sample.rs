@@ -7,9 +7,9 @@ use holod_calibration::TimeNs;
 crate::named::named! {
     /// Which eye a sample was taken of.
     pub enum SampleEye {
-        /// The left eye.
+        /// The viewer's left eye.
         Left = "left",
-        /// The right eye.
+        /// The viewer's right eye.
         Right = "right",
         /// Both: the tracker gives one figure for the pair.
         Both = "both",
@@ -48,7 +48,7 @@ pub struct PupilSample {
     pub t_sample: TimeNs,
     /// When its bytes were read, on the host's monotonic clock.
     pub t_arrival: TimeNs,
-    /// The eye.
+    /// Which eye it was taken of.
     pub eye: SampleEye,
     /// Diameter in millimetres as given, before the rig's scale.
     pub diameter_mm: f32,

@@ -33,10 +33,10 @@ pub(crate) enum SequenceEvent {
     Restart,
 }
 
-/// Of so many numbers before the last one it is known whether they have come.
+/// For how many numbers before the last one it is known whether they have come.
 const REMEMBERED: u64 = 127;
-/// So many numbers in a row that rise, all of which have come before, are a new count of a tracker that had just begun;
-/// a network doubles fewer at once.
+/// This many numbers in a row that rise, all of which have come before, are a new count of a tracker that had just
+/// begun; a network doubles fewer at once.
 const RESTART_RISES: u32 = 5;
 /// A longer leap of the running number is a new count, not a loss: an hour at 1 kHz.
 const LONGEST_GAP: u64 = 3_600_000;

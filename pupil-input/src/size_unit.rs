@@ -5,7 +5,7 @@ use holod_calibration::rig;
 /// What a tracker's figures are, before the rig's scale.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum SizeUnit {
-    /// Diameters in millimetres.
+    /// Diameters in millimetres, as the pupil itself has them.
     #[default]
     Millimetres,
     /// Diameters in pixels of the eye camera.

@@ -103,7 +103,7 @@ fn profile_in(folder: &Path, name: &str) -> String {
 pub struct HostPort {
     /// Name or address; an IPv6 address without its brackets.
     pub host: String,
-    /// Port.
+    /// Number of the TCP or UDP port.
     pub port: u16,
 }
 

@@ -6,9 +6,9 @@ use std::str::FromStr;
 /// USB vendor and product.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct UsbIds {
-    /// Vendor.
+    /// The number of the vendor, `idVendor`.
     pub vendor: u16,
-    /// Product.
+    /// The vendor's number of the product, `idProduct`.
     pub product: u16,
 }
 

@@ -30,7 +30,7 @@ pub enum Packing {
 }
 
 impl Packing {
-    /// Every packing.
+    /// Every packing, in the order in which messages list them.
     pub const ALL: [Self; 5] = [Self::Gray, Self::Gray10, Self::Red8Blue2, Self::Red3Green3Blue4, Self::Red8Green8];
 
     /// The packing's name in a rig file.
@@ -82,7 +82,7 @@ pub enum Orientation {
 }
 
 impl Orientation {
-    /// Every one.
+    /// Every orientation, in the order in which messages list them.
     pub const ALL: [Self; 4] = [Self::Normal, Self::HalfTurn, Self::MirrorX, Self::MirrorY];
 
     /// The name in a rig file.
@@ -120,7 +120,7 @@ pub enum OutOfStroke {
 }
 
 impl OutOfStroke {
-    /// Every way.
+    /// Every way, in the order in which messages list them.
     pub const ALL: [Self; 4] = [Self::Nearest, Self::Clip, Self::Zero, Self::Scale];
 
     /// The name in a rig file.

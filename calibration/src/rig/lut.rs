@@ -10,7 +10,7 @@ use super::files::FileFault;
 const ROWS_QUOTED_MAX: usize = 3;
 /// No panel's stroke is this large: above it the table is in degrees.
 const PHASE_MAX_RAD: f64 = 16.0 * PI;
-/// Tables of the first 2^k levels are those of a panel with k bits from so many on.
+/// A table of this many levels or more, the first 2^k, is that of a panel with k bits.
 const OTHER_DEPTH_MIN: usize = 64;
 /// A table of some levels whose steps back are no more than this share of those forward is one in order, measured with
 /// some noise: in no order the two are about the same.

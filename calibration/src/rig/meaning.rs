@@ -35,7 +35,7 @@ pub struct PerColourFigures<T = f64> {
 /// What follows from a rig file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Meaning {
-    /// The rig's name.
+    /// `name` of the rig file, or the name of the file.
     pub name: String,
     /// The rig file; empty for the built-in rig.
     pub origin: String,
@@ -99,7 +99,7 @@ pub struct Meaning {
 /// The largest blur for one pupil.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct BlurMeaning {
-    /// Pupil diameter.
+    /// Diameter of the pupil, millimetres.
     pub pupil_mm: f64,
     /// Diameter of the largest circle of confusion.
     pub largest_blur_px: f64,
@@ -180,7 +180,7 @@ pub struct LaserMeaning {
     pub stall_timeout_ms: Option<f64>,
 }
 
-/// The eye tracker.
+/// What `[tracker]` comes to, with what holds where it says nothing.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TrackerMeaning {
     /// As on the command line; absent where the rig names none.
@@ -198,11 +198,11 @@ pub struct TrackerMeaning {
 /// A calibration file that is in use.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct ActiveFile {
-    /// `lut` or `flatness`.
+    /// What is read from it: `lut` or `flatness`.
     pub kind: String,
     /// The colour that it serves.
     pub colour: String,
-    /// The file.
+    /// Its path as it was opened: a relative one of the rig file is behind its folder.
     pub path: PathBuf,
 }
 

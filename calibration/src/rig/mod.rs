@@ -31,7 +31,7 @@ use crate::{Colour, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolutio
 /// what is wrong with it, as faults whose key and line are not filled in.
 pub type SpecReader<'a> = &'a dyn Fn(&str, &Path) -> Result<String, Vec<Fault>>;
 
-/// One bench.
+/// One bench, as a rig file describes it or as it is built in.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rig {
     /// A name for logs and reports.
@@ -43,11 +43,11 @@ pub struct Rig {
     /// Size of the panel's image, which the relay puts into the eyepiece's front focal plane, over that of the panel.
     /// The geometry has it: [`DisplayGeometry::eyepiece_focal_length`].
     pub relay_magnification: f64,
-    /// The light sources.
+    /// The lasers, their powers, and when within a field they are lit.
     pub lasers: Lasers,
     /// The eye tracker and what to do without it.
     pub tracker: Tracker,
-    /// The network's weights.
+    /// The network, and the GPU that computes with it.
     pub model: Model,
     /// Where all this was read.
     pub provenance: Provenance,
@@ -73,7 +73,7 @@ pub struct Provenance {
 /// A file of measurements that a rig file names.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFile {
-    /// Where it is.
+    /// Its path as it was opened: a relative one of the rig file is behind its folder.
     pub path: PathBuf,
     /// XXH3 of 64 bits of its bytes as they were read.
     pub xxh3: u64,
@@ -164,7 +164,7 @@ pub enum PanelMode {
     Monochrome(Colour),
 }
 
-/// Sign of d(phase)/d(level).
+/// Whether the phase that the panel gives rises or falls with the level: the sign of d(phase)/d(level).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PhaseSign {
     /// A higher level is a larger phase.
@@ -308,7 +308,7 @@ impl LaserDriver {
     }
 }
 
-/// The eye tracker.
+/// `[tracker]`: where pupil diameters come from, and what holds without them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tracker {
     /// Tracker spec as on the command line, where the rig names one.
@@ -338,7 +338,7 @@ pub enum Eye {
     Better,
 }
 
-/// The network.
+/// `[model]`: what computes the holograms, and how far the pupil moves before the next one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Model {
     /// Which network computes the holograms.
@@ -368,7 +368,7 @@ impl Eye {
     pub const NAMES: [(&'static str, Self); 4] =
         [("left", Self::Left), ("right", Self::Right), ("both", Self::Both), ("better", Self::Better)];
 
-    /// The choice's name.
+    /// Its name in a rig file and on the command line.
     pub fn name(self) -> &'static str {
         Self::NAMES.into_iter().find(|(_, eye)| *eye == self).map_or("", |(name, _)| name)
     }
@@ -575,7 +575,7 @@ impl Rig {
         longest_lit.or(Colour::ALL.into_iter().min_by(is_shorter)).unwrap_or(Colour::Red)
     }
 
-    /// Panel pixels.
+    /// Columns and rows of panel pixels, without the margins of the video frame.
     pub fn resolution(&self) -> Resolution {
         self.geometry.resolution
     }

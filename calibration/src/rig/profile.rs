@@ -25,7 +25,7 @@ static PROFILES: LazyLock<Vec<PanelProfile>> =
 pub struct PanelProfile {
     /// The name that a rig file gives in `panel.profile`.
     pub name: &'static str,
-    /// Maker and model.
+    /// Maker and model, as messages name them.
     pub description: String,
     /// Where the figures come from.
     pub source: String,

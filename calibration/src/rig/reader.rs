@@ -9,9 +9,9 @@ use crate::{Colour, PerColour};
 /// The numbers that a key takes.
 #[derive(Clone, Copy, Debug)]
 pub struct Span {
-    /// Smallest number taken.
+    /// The smallest number that is taken, in the unit.
     pub min: f64,
-    /// Largest number taken.
+    /// The largest number that is taken, in the unit.
     pub max: f64,
     /// The unit that the key's suffix names.
     pub(super) unit: &'static str,

@@ -36,7 +36,7 @@ const LAYOUT: [(&str, &[&str]); 5] = [
 /// How a laser that takes commands in text is spoken to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TextLaserProfile {
-    /// Maker and model.
+    /// Maker and model, as messages name them.
     pub description: String,
     /// Rate of its serial port, baud; 8 bits, no parity, one stop bit.
     pub baud: u32,
@@ -66,7 +66,7 @@ pub struct TextLaserProfile {
 /// A question and the answers that are right.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Question {
-    /// What is asked.
+    /// The command that asks, without its line ending.
     pub ask: String,
     /// Which answers are right.
     pub expect: Expected,
@@ -80,7 +80,7 @@ pub struct Question {
 pub enum Expected {
     /// Those with this in them.
     Contains(String),
-    /// These.
+    /// Exactly one of these.
     OneOf(Vec<String>),
     /// Digits and nothing else.
     Digits,

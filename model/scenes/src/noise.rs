@@ -12,7 +12,7 @@ const OUT_OF_FOCUS_PX: f64 = 8.0;
 /// Variance of the rendering noise of one pupil's stack in dB below the peak of 1; NaN where no pixel counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Noise {
-    /// The pupil.
+    /// The pupil that the stack is rendered for.
     pub pupil: PupilDiameter,
     /// Over every pixel of every plane.
     pub all_db: f64,

@@ -35,9 +35,9 @@ const LOG_STRATA_BLUR_PX: (f64, f64) = (5.0, 800.0 / 7.0);
 /// Which pupils a scene is rendered for.
 #[derive(Clone, Debug, PartialEq)]
 pub enum PupilPlan {
-    /// One random pupil in each of so many equal parts of 1 to 5 mm, drawn anew for each scene.
+    /// One random pupil in each of this many equal parts of 1 to 5 mm, drawn anew for each scene.
     Strata(usize),
-    /// One random pupil in each of so many parts, equal in logarithm, of those that blur by 5 to 114 pixels over the
+    /// One random pupil in each of this many parts, equal in logarithm, of those that blur by 5 to 114 pixels over the
     /// depth volume: for networks that serve many benches, on which eyes see such blurs.
     LogStrata(usize),
     /// These, in every scene.
@@ -142,10 +142,10 @@ impl FromStr for PupilPlan {
 /// At which focus planes a scene is rendered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlanePlan {
-    /// So many, at least two, uniform in dioptres, both ends of the depth range included.
+    /// This many, at least two, uniform in dioptres, both ends of the depth range included.
     Uniform(usize),
-    /// One at random in each of so many parts, at least two, of the depth range, equal in dioptres, drawn anew for each
-    /// scene: so a network cannot learn to be sharp at a few focuses only.
+    /// One at random in each of this many parts, at least two, of the depth range, equal in dioptres, drawn anew for
+    /// each scene: so a network cannot learn to be sharp at a few focuses only.
     Strata(usize),
 }
 
@@ -204,7 +204,7 @@ pub struct ShardPlan {
 
 /// A scene, and what is asked of it in the terms of the bench that it is laid out for.
 pub struct PlannedScene {
-    /// The scene.
+    /// The surfaces and the resolution at which they are rendered.
     pub scene: Scene,
     /// On the default bench.
     pub pupils: Vec<PupilDiameter>,
@@ -252,7 +252,7 @@ pub enum ShardError {
     /// The graphics processor could not render the scene.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// [`stop_writing`] was called.
+    /// Nothing is written any more, since [`stop_writing`] was called.
     #[error("no scene is written any more: the program ends")]
     Stopped,
 }

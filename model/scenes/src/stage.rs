@@ -17,7 +17,7 @@ impl Reach {
     /// For pupils of up to 8 mm on the default bench, whose outermost ray goes 20 px a dioptre.
     pub(super) const USUAL: Self = Self { overscan_px: 60.0, steepest: 0.03, steepest_wall: 0.045 };
 
-    /// For a pupil of so many pixels of radius a dioptre: the usual where that is enough.
+    /// For a pupil whose radius is this many pixels a dioptre: the usual where that is enough.
     pub(super) fn of_radius(radius_px_per_dpt: f32) -> Self {
         let wider = (radius_px_per_dpt / 20.0).max(1.0);
         let Self { overscan_px, steepest, steepest_wall } = Self::USUAL;

@@ -22,7 +22,7 @@ enum Kind {
 }
 
 impl Tracer {
-    /// On the processor.
+    /// One that renders on the cores of the processor.
     pub fn cpu() -> Self {
         Self(Kind::Cpu)
     }

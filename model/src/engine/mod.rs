@@ -28,7 +28,7 @@ pub use gpu::{EncodedCounts, GpuEngine};
 /// What the layers of a network multiply, which is most of what is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Precision {
-    /// 32 bits.
+    /// Numbers of 32 bits, IEEE 754.
     Single,
     /// 16 bits, with sums in 32: two products at once. On a GPU these are half-precision numbers, as which features are
     /// stored as well; on a processor bfloat16s. Where the device has none, single precision takes its place.
@@ -107,7 +107,7 @@ pub struct StageTimings {
 pub struct StageTiming {
     /// The stage's name, such as `layer 3`.
     pub name: String,
-    /// Wall-clock time.
+    /// Wall-clock time that the stage took of the last frame.
     pub duration: Duration,
     /// Floating-point operations of matrix-like work as its definition has them, two to a multiply-add; 0 for other
     /// stages. Winograd's filtering does with a quarter of those of a plain layer.

@@ -16,7 +16,7 @@ pub(crate) use device::tests::{test_adapters, test_gpu};
 /// Which devices will do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Adapters {
-    /// Graphics processors.
+    /// Graphics processors, and no program that plays one.
     Hardware,
     /// A processor that plays one: right, and slow.
     Software,
@@ -25,7 +25,7 @@ pub enum Adapters {
 /// Which device is wanted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpuChoice<'a> {
-    /// Of these.
+    /// The kind of device that it is chosen from.
     pub adapters: Adapters,
     /// The one that has this in its name, whatever its case, or is at this place of the PCI bus (`0000:01:00.0`); the
     /// best one where none is named.

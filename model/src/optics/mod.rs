@@ -21,14 +21,14 @@ pub(crate) use upsample::FourierUpsampler;
 /// Amplitude and phase of each colour at the SLM plane, [3, height, width]. |value|² is linear light with white = 1.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ComplexHologram {
-    /// Width and height.
+    /// Columns and rows of one colour, in panel pixels.
     pub resolution: Resolution,
     /// Values, row-major within each colour, colours in the order red, green, blue.
     pub field: Vec<Complex32>,
 }
 
 impl ComplexHologram {
-    /// A dark hologram.
+    /// A hologram without light: amplitude 0 everywhere.
     pub fn dark(resolution: Resolution) -> Self {
         Self { resolution, field: vec![Complex32::ZERO; 3 * resolution.pixels()] }
     }
@@ -49,14 +49,14 @@ impl ComplexHologram {
 /// Phase of each colour at the SLM plane in radians, in [0, 2π), [3, height, width].
 #[derive(Clone, Debug, PartialEq)]
 pub struct PhasePattern {
-    /// Width and height.
+    /// Columns and rows of one colour, in panel pixels.
     pub resolution: Resolution,
     /// Values, row-major within each colour, colours in the order red, green, blue.
     pub phase_rad: Vec<f32>,
 }
 
 impl PhasePattern {
-    /// Phase zero everywhere.
+    /// A pattern of phase 0 everywhere, which leaves light as it is.
     pub fn flat(resolution: Resolution) -> Self {
         Self { resolution, phase_rad: vec![0.0; 3 * resolution.pixels()] }
     }

@@ -35,11 +35,11 @@ pub enum ArrayDepths<'a> {
 /// A picture with depth.
 #[derive(Clone, Copy, Debug)]
 pub struct ArrayPicture<'a> {
-    /// Width and height.
+    /// Columns and rows, which both arrays have.
     pub resolution: Resolution,
-    /// Its colours.
+    /// The colour of each pixel.
     pub colours: ArrayColours<'a>,
-    /// Its depths.
+    /// The depth of each pixel.
     pub depths: ArrayDepths<'a>,
     /// Whether pixels without a depth are filled from their surroundings; else they are an error.
     pub fills_missing: bool,

@@ -14,7 +14,7 @@ pub struct ClippedColours {
 }
 
 impl ClippedColours {
-    /// All of them.
+    /// Pixels that were clipped at either end.
     pub const fn in_all(self) -> usize {
         self.above_white_px + self.below_black_px
     }

@@ -38,7 +38,7 @@ pub struct FocalStack {
     pub amplitude: Vec<f32>,
     /// Where each image is focused, far to near.
     pub focuses: Vec<Dioptres>,
-    /// The eye's pupil.
+    /// The pupil that all images are seen through.
     pub pupil: PupilDiameter,
 }
 

@@ -26,13 +26,13 @@ pub enum LiveDepth {
     Plane(Dioptres),
     /// Unsigned 16-bit millimetres; 0 is no depth.
     MillimetresU16,
-    /// Half floats, metres.
+    /// Metres as IEEE 754 numbers of 16 bits.
     MetresF16,
-    /// Half floats, dioptres.
+    /// Dioptres as IEEE 754 numbers of 16 bits.
     DioptresF16,
-    /// Floats, metres.
+    /// Metres as IEEE 754 numbers of 32 bits.
     MetresF32,
-    /// Floats, dioptres.
+    /// Dioptres as IEEE 754 numbers of 32 bits.
     DioptresF32,
 }
 
@@ -83,7 +83,7 @@ pub struct LiveReport {
 /// Numbers that are no depths, by what they are.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MissingDepths {
-    /// Pixels with NaN.
+    /// Pixels whose depth is not a number.
     pub nan: usize,
     /// Pixels with 0, where that is no depth.
     pub zero: usize,

@@ -56,7 +56,7 @@ const ROUNDING: f32 = 1e-5;
 /// One RGB-D frame as the network reads it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RgbdFrame {
-    /// Width and height.
+    /// Columns and rows of one colour.
     pub resolution: Resolution,
     /// Square root of linear light, 0..=1, [3, height, width].
     pub amplitude: Vec<f32>,
@@ -109,7 +109,7 @@ pub enum DepthEncoding {
     Metres,
     /// Millimetres; 0 is missing.
     Millimetres,
-    /// Dioptres.
+    /// Dioptres of 0 or more; 0 is infinitely far.
     Dioptres,
     /// 0 at `far_dpt` and 1 at `near_dpt`, uniform in dioptres. Of an integer file the largest integer is 1, unless a
     /// scale says otherwise.
@@ -139,7 +139,7 @@ pub enum Fit {
 /// A picture of a scene before it is fitted to the depth range of a bench.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScenePicture {
-    /// Width and height.
+    /// Columns and rows of one colour.
     pub resolution: Resolution,
     /// Linear light, 0..=1, [3, height, width].
     pub linear: Vec<f32>,

@@ -24,7 +24,7 @@ pub(crate) const MOST_DEPTH_LAYERS: usize = 64;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NetworkConfig {
-    /// The family.
+    /// The family of networks that it is of, which says what its input and its layers are.
     pub architecture: Architecture,
     /// Version of the family; 2 is known.
     pub version: u32,
@@ -116,7 +116,7 @@ impl fmt::Display for Architecture {
 pub enum Grid {
     /// Half the resolution in each direction; the field is Fourier-upsampled by 2 afterwards.
     HalfBand,
-    /// The panel's own.
+    /// The grid of the panel itself, so that nothing is upsampled.
     Full,
 }
 

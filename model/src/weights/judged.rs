@@ -8,7 +8,7 @@ use serde::Deserialize;
 pub struct JudgedBench {
     /// The bench's name in the evaluation.
     pub name: String,
-    /// At one pupil.
+    /// What was reached there for the pupil whose blur is most like the one that was asked for.
     pub judged: Judged,
 }
 

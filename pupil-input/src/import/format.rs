@@ -5,29 +5,29 @@ use std::fmt;
 /// The kinds of log that are known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LogFormat {
-    /// holod's line protocol.
+    /// Lines of holod's own protocol for microcontrollers.
     Lines,
     /// Pupil Labs Neon, 3D eye states of its cloud.
     NeonEyeStates,
     /// holod's recording of the bytes of a link.
     Raw,
-    /// holod's own CSV.
+    /// holod's own CSV, as `holod log convert` writes it.
     Csv,
     /// Tobii Pro Lab or Studio.
     Tobii,
     /// Gazepoint Analysis or Control.
     Gazepoint,
-    /// PupilEXT.
+    /// The CSV that PupilEXT records.
     PupilExt,
     /// Lab Streaming Layer recordings.
     Xdf,
-    /// BIDS eye tracking.
+    /// Eye tracking in the Brain Imaging Data Structure: tables with a JSON sidecar.
     Bids,
     /// Pupil Labs Neon, eye states as its phone writes them.
     NeonNative,
-    /// Pupil Labs Core.
+    /// Pupil Labs Core, `pupil_positions.csv` of its player.
     Core,
-    /// SR Research EyeLink.
+    /// SR Research EyeLink, `.asc` as `edf2asc` writes it.
     EyeLink,
     /// SMI, of BeGaze or the IDF converter.
     Smi,

@@ -65,9 +65,9 @@ pub struct LogInfo {
 /// How often something was rejected.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct FaultCount {
-    /// The reason.
+    /// The reason, under the name by which it is counted.
     pub name: &'static str,
-    /// How often.
+    /// Lines or cells that were rejected for it.
     pub count: u64,
 }
 
@@ -88,7 +88,7 @@ pub struct BlinkCounts {
 pub struct EyeInfo {
     /// `left`, `right`, or `both` where the log does not tell the eyes apart.
     pub eye: &'static str,
-    /// Samples.
+    /// Samples of this eye, lost ones as well.
     pub samples: u64,
     /// Samples in which the tracker saw a pupil.
     pub valid: u64,
@@ -115,7 +115,7 @@ pub struct EyeInfo {
     pub missing: u64,
     /// Diameters of valid samples with a confidence of at least 0.6.
     pub diameter: Option<Range>,
-    /// Blinks that the log tells of this eye.
+    /// Blinks of this eye that the log has.
     pub blinks_told: u64,
     /// Blinks found; None for an eye that is not judged.
     pub blinks_found: Option<u64>,
@@ -126,15 +126,15 @@ pub struct EyeInfo {
 /// How a quantity is spread.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Range {
-    /// Least.
+    /// The least value; the unit is that of the quantity.
     pub least: f32,
-    /// First percentile.
+    /// The value that one in a hundred lies below.
     pub p1: f32,
-    /// Median.
+    /// The value that half of all lie below.
     pub median: f32,
-    /// 99th percentile.
+    /// The value that 99 in a hundred lie below.
     pub p99: f32,
-    /// Greatest.
+    /// The greatest value, one outlier being enough.
     pub greatest: f32,
 }
 

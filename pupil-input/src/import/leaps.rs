@@ -10,9 +10,9 @@ const LONGEST_NS: i64 = 600_000_000_000;
 const LEFT_NS: i64 = 1_000_000_000;
 /// Lines behind a silence that are kept.
 const KEPT: usize = 64;
-/// Of them so many are named.
+/// How many of them are named.
 const TOLD: usize = 5;
-/// A log with a longer silence more often than once in so many samples is a sparse one.
+/// A log with a longer silence more often than once in this many samples is a sparse one.
 const LEAST_ROWS: usize = 8;
 
 /// Where the samples of an eye leap ahead.

@@ -82,7 +82,7 @@ const fn log_sample(sample: &PupilSample) -> LogSample {
     }
 }
 
-/// How many pieces a record of [`Kind::Lost`] tells of.
+/// How many pieces a record of [`Kind::Lost`] counts.
 fn lost_chunks(payload: &[u8]) -> u64 {
     payload.first_chunk().map_or(0, |count| u64::from_le_bytes(*count))
 }

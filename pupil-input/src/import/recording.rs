@@ -72,7 +72,7 @@ pub(crate) struct LogBuilder {
     leaps: Leaps,
 }
 
-/// So many samples of an eye in a row are a part of their own; fewer that lie far back are wrong times.
+/// This many samples of an eye in a row are a part of their own; fewer that lie far back are wrong times.
 const PART_SAMPLES: usize = 8;
 /// By how many samples one eye may be behind the other before the whole log is sorted.
 const EYES_OUT_OF_STEP: usize = 64;
@@ -306,7 +306,7 @@ impl LogBuilder {
         Ok(Recording { format, unit, rows, blinks, faults, stated_rate_hz, recorded_scale, notes: all, warned })
     }
 
-    /// Tells of the parts.
+    /// Notes the parts.
     fn end_parts(&mut self) {
         let mut restarts = LineList::default();
         self.parts.restarts().for_each(|line| restarts.take(line));
@@ -419,7 +419,7 @@ impl Recording {
         &self.blinks
     }
 
-    /// What was rejected.
+    /// How many lines or cells were rejected, by reason.
     pub const fn faults(&self) -> LogFaults {
         self.faults
     }

@@ -28,9 +28,9 @@ pub struct Profile {
     pub unit: SizeUnit,
     /// What one unit on the wire is multiplied by to that; 1 where the profile knows no conversion.
     pub mm_per_unit: f64,
-    /// Its serial port.
+    /// How it is reached through a serial port.
     pub serial: SerialSettings,
-    /// Its HID device.
+    /// How it is found among the HID devices.
     pub hid: HidSettings,
     /// Its address on a network.
     pub network: NetworkSettings,
@@ -41,7 +41,7 @@ pub struct Profile {
 /// How a tracker is reached through a serial port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SerialSettings {
-    /// Bits a second.
+    /// Rate of the line, bits a second.
     pub baud: u32,
     /// The USB devices that it may be; none where its adapter may be any.
     pub usb: Vec<UsbIds>,
@@ -76,7 +76,7 @@ pub struct NetworkSettings {
 /// Something to say to a tracker.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Command {
-    /// The bytes.
+    /// The bytes that are sent, nothing added.
     pub send: Vec<u8>,
     /// Bytes that its answer holds; None where it gives none.
     pub expect: Option<Vec<u8>>,
@@ -99,7 +99,7 @@ pub enum ProfileError {
     /// Its file cannot be read.
     #[error("tracker profile {path}: {reason}; expected a readable TOML file")]
     Unreadable { path: PathBuf, reason: String },
-    /// It is wrong.
+    /// It was read, and some of its keys are wrong or missing.
     #[error("tracker profile {origin}: {}", in_words(.faults))]
     Wrong {
         /// Its name or file.

@@ -246,7 +246,7 @@ pub(crate) enum Ending {
     Whole,
     /// Between two records.
     CutOff,
-    /// Within a record, with so many bytes from there to the end of the file, and no whole record in them.
+    /// Within a record, with this many bytes from there to the end of the file, and no whole record in them.
     Torn { unread_bytes: u64 },
     /// With something of `bytes` bytes behind it, from byte `at` of the file (counted from 0) on.
     Followed { at: u64, bytes: u64 },
@@ -307,8 +307,8 @@ impl Damage {
 const LONGEST_RECORD: usize = RECORD_HEAD_BYTES + MAX_PAYLOAD_BYTES + 4;
 /// Bytes read at a time, at least.
 const READ_BYTES: usize = 4096;
-/// In a search for the next record so many bytes may be summed, and so many more for each that is passed over: what was
-/// made up to look like the beginnings of records does not take hours.
+/// A search for the next record may sum this many bytes, and as many more as follow for each byte that it passes over:
+/// what was made up to look like the beginnings of records does not take hours.
 const SUMMED: u64 = 1 << 22;
 const SUMMED_PER_BYTE: u64 = 64;
 

@@ -35,8 +35,8 @@ pub(crate) struct Taps {
     raw: Option<rtrb::Producer<u8>>,
     decisions: Option<rtrb::Producer<Decision>>,
     connection: u32,
-    /// Pieces lost of which the file does not tell yet.
-    untold: u64,
+    /// Pieces lost that the file does not count yet.
+    lost: u64,
     /// Of the last record that was put in.
     t_last: TimeNs,
     shared: Arc<Shared>,
@@ -64,7 +64,7 @@ pub(crate) fn start(files: &RecordFiles, header: Option<&Header>) -> Result<(Tap
         raw: None,
         decisions: None,
         connection: 0,
-        untold: 0,
+        lost: 0,
         t_last: header.map_or(TimeNs(0), |header| header.t_started),
         shared: Arc::clone(&shared),
     };
@@ -126,16 +126,16 @@ impl Taps {
     fn put(&mut self, kind: Kind, t: TimeNs, payload: &[u8]) {
         let Some(ring) = &mut self.raw else { return };
         let connection = self.connection;
-        if self.untold > 0 {
+        if self.lost > 0 {
             let head = RecordHead { kind: Kind::Lost, t: self.t_last, connection };
-            if push(ring, &head, &self.untold.to_le_bytes()) {
-                self.untold = 0;
+            if push(ring, &head, &self.lost.to_le_bytes()) {
+                self.lost = 0;
             }
         }
-        if self.untold == 0 && push(ring, &RecordHead { kind, t, connection }, payload) {
+        if self.lost == 0 && push(ring, &RecordHead { kind, t, connection }, payload) {
             self.t_last = t;
         } else {
-            self.untold += 1;
+            self.lost += 1;
             self.shared.chunks_lost.fetch_add(1, Ordering::Relaxed);
         }
     }
@@ -381,7 +381,7 @@ mod tests {
         let out = Output::create(path, &header().encode()).expect("makes");
         let writer =
             Writer { raw: Some(RawWriter::new(ring, TimeNs(7), out)), decisions: None, shared: Arc::clone(&shared) };
-        let taps = Taps { raw: Some(producer), decisions: None, connection: 0, untold: 0, t_last: TimeNs(7), shared };
+        let taps = Taps { raw: Some(producer), decisions: None, connection: 0, lost: 0, t_last: TimeNs(7), shared };
         (taps, writer)
     }
 

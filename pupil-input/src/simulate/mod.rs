@@ -43,7 +43,7 @@ pub enum Scenario {
 }
 
 impl Scenario {
-    /// Every scenario.
+    /// Every scenario, in the order in which messages list them.
     pub const ALL: [Self; 7] =
         [Self::LightSteps, Self::Sweep, Self::Steady, Self::Blinks, Self::Dropouts, Self::Reflex, Self::Squint];
 
@@ -65,7 +65,7 @@ impl Scenario {
         Self::ALL.into_iter().find(|scenario| scenario.name() == name)
     }
 
-    /// Its text.
+    /// The script of the scenario, as its file in `scenarios/` has it.
     pub const fn text(self) -> &'static str {
         match self {
             Self::LightSteps => include_str!("../../scenarios/light-steps.txt"),
@@ -78,7 +78,7 @@ impl Scenario {
         }
     }
 
-    /// Its text, read.
+    /// The script of the scenario, ready to be simulated.
     pub fn script(self) -> Script {
         Script::parse(self.name(), self.text()).expect("the built-in scenarios are tested")
     }

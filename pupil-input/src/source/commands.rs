@@ -25,7 +25,7 @@ pub(crate) trait Dialogue {
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum CommandError {
-    /// The link failed.
+    /// The link failed while a command went out or its answer was awaited.
     #[error("the link failed at `{command}`: {source}")]
     Link {
         /// What was to be sent, or had been.
@@ -182,7 +182,7 @@ fn hung_up() -> io::Error {
 mod tests {
     use super::*;
 
-    /// A tracker that answers the given command, after so many deaf tries, in pieces.
+    /// A tracker that answers the given command, after a number of deaf tries, in pieces.
     struct Script {
         deaf: u32,
         answers: Vec<(&'static [u8], Vec<&'static [u8]>)>,

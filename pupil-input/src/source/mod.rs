@@ -73,13 +73,13 @@ pub(crate) trait Feed: Send {
 /// Why a tracker cannot be reached.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// A serial port.
+    /// Why a serial port cannot be used.
     #[error(transparent)]
     Serial(#[from] SerialError),
     /// A TCP or UDP link.
     #[error(transparent)]
     Network(#[from] NetworkError),
-    /// A HID device.
+    /// Why a HID device cannot be used.
     #[error(transparent)]
     Hid(#[from] HidError),
     /// The server of a Pupil Labs tracker.

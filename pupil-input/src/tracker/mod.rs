@@ -172,7 +172,7 @@ pub enum ChangeError {
     Busy,
 }
 
-/// Starts trackers.
+/// What checks tracker specs and starts the threads that read trackers.
 #[derive(Debug)]
 pub struct Tracker;
 
@@ -222,7 +222,7 @@ impl Tracker {
         let settings = EstimatorSettings::from(&figures.scaled(settings));
         let (input, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings));
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
-        let (troubles, untold) = rtrb::RingBuffer::new(TROUBLES);
+        let (trouble_producer, troubles) = rtrb::RingBuffer::new(TROUBLES);
         let (changes, change_consumer) = rtrb::RingBuffer::new(CHANGES);
         let shared = Arc::new(Shared {
             counters: Counters::new(),
@@ -235,7 +235,7 @@ impl Tracker {
             clock: StreamClock::LIVE,
             published: input,
             tap: producer,
-            troubles,
+            troubles: trouble_producer,
             changes: change_consumer,
             record: taps,
             arrivals_of_stream: false,
@@ -260,7 +260,7 @@ impl Tracker {
                 recorder,
                 warnings,
                 remarks,
-                untold,
+                troubles,
                 trouble: None,
                 changes,
                 figures,
@@ -274,7 +274,7 @@ impl TrackerHandle {
     pub fn ended(settings: &rig::Tracker) -> Self {
         let (_, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings.into()));
         let (_, consumer) = rtrb::RingBuffer::new(1);
-        let (_, untold) = rtrb::RingBuffer::new(1);
+        let (_, troubles) = rtrb::RingBuffer::new(1);
         let (changes, _) = rtrb::RingBuffer::new(1);
         let shared = Arc::new(Shared {
             counters: Counters::new(),
@@ -291,7 +291,7 @@ impl TrackerHandle {
                 recorder: None,
                 warnings: Vec::new(),
                 remarks: Vec::new(),
-                untold,
+                troubles,
                 trouble: None,
                 changes,
                 figures: SizeUnit::Millimetres.into(),
@@ -345,7 +345,7 @@ pub struct TrackerControl {
     recorder: Option<Recorder>,
     warnings: Vec<String>,
     remarks: Vec<String>,
-    untold: rtrb::Consumer<String>,
+    troubles: rtrb::Consumer<String>,
     trouble: Option<String>,
     changes: rtrb::Producer<EstimatorSettings>,
     figures: Figures,
@@ -390,7 +390,7 @@ impl TrackerControl {
 
     /// Why a link that was lost does not come back, why a log brings nothing for long, or why nothing comes of one that is up, while it is so.
     pub fn trouble(&mut self) -> Option<&str> {
-        while let Ok(text) = self.untold.pop() {
+        while let Ok(text) = self.troubles.pop() {
             self.trouble = Some(text).filter(|text| !text.is_empty());
         }
         self.trouble.as_deref()

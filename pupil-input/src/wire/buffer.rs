@@ -1,6 +1,6 @@
 //! Bytes that are held until they can be read.
 
-/// So many bytes and no more; it allocates when it is made.
+/// A buffer of a fixed size, which is allocated when it is made.
 #[derive(Clone, Debug)]
 pub(super) struct Buffer {
     bytes: Box<[u8]>,

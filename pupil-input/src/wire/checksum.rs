@@ -17,7 +17,7 @@ pub enum ChecksumKind {
 /// The parameters of a cyclic redundancy check, named as in the catalogue of parametrised CRC algorithms (reveng).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Crc {
-    /// 8 or 16.
+    /// Width of the register and of the sum, 8 or 16 bits.
     pub bits: u32,
     /// The polynomial without its highest term, not reflected.
     pub polynomial: u16,

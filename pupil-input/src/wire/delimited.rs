@@ -32,20 +32,20 @@ pub struct DelimitedSettings {
     /// The checksum in two or four hexadecimal digits behind the last `*`, and how many of the line's first bytes it
     /// leaves out.
     pub checksum: Option<(ChecksumKind, usize)>,
-    /// Where everything stands.
+    /// In which columns time, eye and pupils stand.
     pub layout: Layout<Column>,
 }
 
 /// What stands between two columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Separator {
-    /// This byte.
+    /// One of this byte; two in a row have an empty column between them.
     Byte(u8),
     /// Any number of blanks and tabs.
     Whitespace,
 }
 
-/// A column.
+/// A column of the lines, as a profile names it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Column {
     /// By its number, from 1.

@@ -25,10 +25,10 @@ pub struct Layout<P> {
     pub size: SizeRule,
 }
 
-/// A time.
+/// Where a message has its time, and how that is read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimeAt<P> {
-    /// Its place.
+    /// Where it stands.
     pub at: P,
     /// Nanoseconds of one of its units: of a second, a microsecond, a frame.
     pub ns_per_tick: f64,
@@ -36,12 +36,12 @@ pub struct TimeAt<P> {
     pub wrap_bits: Option<u32>,
 }
 
-/// A pupil.
+/// Where a message has a pupil, and how that is read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PupilAt<P> {
     /// Its eye; None where the message tells it.
     pub eye: Option<SampleEye>,
-    /// Its size.
+    /// Diameter, radius or area, as [`Layout::size`] says.
     pub size: Figure<P>,
     /// What stands in place of the size of a lost pupil.
     pub lost: Vec<Literal>,
@@ -56,11 +56,11 @@ pub struct PupilAt<P> {
 /// A figure: what stands there, times `scale`, plus `offset`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Figure<P> {
-    /// Its place.
+    /// Where the raw number stands.
     pub at: P,
-    /// Factor.
+    /// What the raw number is multiplied by; the unit of the product is the figure's.
     pub scale: f64,
-    /// Summand.
+    /// What is added then, in the unit of the figure.
     pub offset: f64,
 }
 
@@ -76,7 +76,7 @@ pub enum Literal {
 /// When what stands in a place says that the pupil is seen.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Validity {
-    /// It is this.
+    /// It is exactly this.
     Equals(Literal),
     /// It is anything but this.
     Differs(Literal),
@@ -93,11 +93,11 @@ pub enum Validity {
 /// What a size is of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SizeKind {
-    /// The diameter.
+    /// The diameter of the pupil.
     Diameter,
-    /// Half of it.
+    /// Half the diameter.
     Radius,
-    /// The area.
+    /// The area, which is taken for that of a disc.
     Area,
 }
 
@@ -145,19 +145,19 @@ impl<P> PupilAt<P> {
 /// Type of a number in a binary message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NumberType {
-    /// One byte.
+    /// One byte, unsigned.
     U8,
     /// One byte, two's complement.
     I8,
-    /// Two bytes.
+    /// Two bytes, unsigned.
     U16,
     /// Two bytes, two's complement.
     I16,
-    /// Four bytes.
+    /// Four bytes, unsigned.
     U32,
     /// Four bytes, two's complement.
     I32,
-    /// Eight bytes.
+    /// Eight bytes, unsigned.
     U64,
     /// Four bytes, IEEE 754.
     F32,
@@ -166,7 +166,7 @@ pub enum NumberType {
 }
 
 impl NumberType {
-    /// Its bytes.
+    /// How many bytes it takes in a message.
     pub const fn bytes(self) -> usize {
         match self {
             Self::U8 | Self::I8 => 1,
@@ -187,9 +187,9 @@ impl NumberType {
 pub struct Field {
     /// Bytes before it; negative where it is counted from the message's end.
     pub at: i32,
-    /// Its type.
+    /// How its bytes make a number.
     pub kind: NumberType,
-    /// Highest byte first.
+    /// Whether its highest byte comes first.
     pub big_endian: bool,
     /// Bits of a whole number that are shifted out below...
     pub shift: u32,
@@ -308,7 +308,7 @@ struct Unwrapped {
     last: Option<(u64, i64)>,
 }
 
-/// The greatest number of a counter of so many bits; none of one that never begins again.
+/// The greatest number of a counter of `bits` bits; none of one that never begins again.
 fn wrap_mask(bits: Option<u32>) -> Option<u64> {
     bits.filter(|bits| *bits < 63).map(|bits| (1_u64 << bits) - 1)
 }
@@ -626,7 +626,7 @@ mod tests {
         assert_eq!([i64::MAX, -1].map(|raw| counter.next(raw, None)), [i64::MAX, -1]);
     }
 
-    /// What running numbers of so many bits, with times in seconds, tell after the first.
+    /// What running numbers of some bits, with times in seconds, tell after the first.
     fn told(bits: u32, numbers: &[(i64, Option<i64>)]) -> Vec<SequenceEvent> {
         let (mut numbering, mut tracker) = (Numbering::default(), SequenceTracker::new());
         let event = |&(raw, t_s): &(i64, Option<i64>)| {

@@ -93,7 +93,7 @@ impl fmt::Display for Usage {
 /// One figure of an input report, as the descriptor describes it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ReportField {
-    /// What it is.
+    /// What it is for, by page and number.
     pub usage: Usage,
     /// The usage of the innermost collection around it that has one.
     pub collection: Option<Usage>,

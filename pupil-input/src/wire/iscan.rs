@@ -16,7 +16,7 @@ const SYNC: [u8; 2] = [0x44, 0x44];
 /// A pupil among the words of a packet.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct IscanPupil {
-    /// The eye.
+    /// Which eye its samples are of.
     pub eye: SampleEye,
     /// Which word is its diameter, counted from 0.
     pub word: usize,

@@ -24,15 +24,15 @@ pub const MAX_LINE_BYTES: usize = 256;
 /// The fields of one line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LineSample {
-    /// Running number.
+    /// Running number, one more in each line; two eyes of one instant may share one.
     pub sequence: u64,
     /// The tracker's clock, microseconds.
     pub device_us: i64,
-    /// The eye.
+    /// Which eye it was taken of.
     pub eye: SampleEye,
     /// Diameter, millimetres, finite and not negative.
     pub diameter_mm: f32,
-    /// Confidence, 0..=1.
+    /// Confidence, 0 to 1; with a diameter of 0, 0 says that the pupil was lost.
     pub confidence: f32,
 }
 

@@ -42,7 +42,7 @@ pub struct WireSample {
     /// The tracker's own clock; its origin means nothing. None where the wire carries no time: the time of arrival
     /// stands in for it.
     pub t_device: Option<TimeNs>,
-    /// The eye.
+    /// Which eye it was taken of.
     pub eye: SampleEye,
     /// Diameter in millimetres, by the profile's conversion; in the tracker's own unit where only the rig's scale knows
     /// the conversion. Means nothing unless `valid`.
@@ -84,7 +84,7 @@ crate::named::named! {
         MissingField = "wire_missing_field",
         /// Bytes between two messages that belong to neither.
         OutOfStep = "wire_out_of_step",
-        /// It tells of more views, of another eye or camera, than the profile has.
+        /// It has more views, of another eye or camera, than the profile.
         MoreViews = "wire_more_views",
         /// The pupil is seen, and has no size in millimetres: the tracker was not calibrated.
         Uncalibrated = "wire_uncalibrated",
@@ -135,17 +135,17 @@ pub trait Decoder: Send {
 /// How a tracker's bytes are read: every decoder, with its settings.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Format {
-    /// holod's line protocol.
+    /// holod's own protocol for microcontrollers, a line a sample.
     Lines,
-    /// Lines with columns.
+    /// Lines of text with a fixed set of columns.
     Delimited(DelimitedSettings),
-    /// Binary packets.
+    /// Binary packets with a sync word, as a stream.
     Packet(PacketSettings),
-    /// Whole messages.
+    /// Binary messages that come whole: HID reports, datagrams.
     Report(ReportSettings),
-    /// ISCAN's binary packets.
+    /// Binary packets of ISCAN's ETL series.
     Iscan(IscanSettings),
-    /// LiveTrack's rows.
+    /// Rows of text of Cambridge Research Systems' LiveTrack.
     LiveTrack(LiveTrackSettings),
     /// Gazepoint's Open Gaze records.
     OpenGaze(OpenGazeSettings),

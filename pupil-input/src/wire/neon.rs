@@ -13,7 +13,7 @@
 //! | 65 | gaze, worn, and for each eye, the left one first: pupil diameter in mm, eyeball centre, optical axis (7 × f32) |
 //! | 89 | that and for each eye: angles of the upper and the lower lid, aperture between them in mm (3 × f32) |
 //!
-//! Only the last two tell of pupils; the others are [`WireEvent::Note`]s.
+//! Only the last two hold pupils; the others are [`WireEvent::Note`]s.
 //!
 //! RTCP's sender reports tie RTP time to Unix time (RFC 3550, 6.4.1): `t_device` is Unix time, as in Neon's own
 //! recordings, and `None` until the first report. Reports that disagree by less than [`CLOCK_STEP`] are taken in
@@ -34,7 +34,8 @@ use crate::SampleEye;
 pub(crate) const MAX_TEXT_BYTES: usize = 4096;
 /// Bytes of the longest packet. The gaze stream's have 101; after rubbish no more than this can be swallowed.
 const MAX_PACKET_BYTES: usize = 256;
-/// The phone's clock shows at most so much more than the newest packet does; what shows more, or less, is another one.
+/// The phone's clock is ahead of the newest packet's time by this at most, nanoseconds; one further ahead, or behind
+/// it, is another clock.
 const CLOCKS_ALIKE: i128 = 500_000_000;
 const FRAME_HEADER_BYTES: usize = 4;
 const RTP_HEADER_BYTES: usize = 12;
@@ -68,9 +69,9 @@ enum Step {
 enum Front {
     /// The beginning of a message, or of none: that needs more bytes to tell.
     Unknown,
-    /// A packet of so many bytes behind its frame header.
+    /// A packet of this many bytes behind its frame header.
     Packet(usize),
-    /// An RTSP message of so many bytes, with its body.
+    /// An RTSP message of this many bytes, with its body.
     Text(usize),
     /// The first byte belongs to no message.
     Rubbish,

@@ -21,7 +21,7 @@ pub struct PacketSettings {
     pub length: PacketLength,
     /// What holds a packet to be whole.
     pub checksum: Option<PacketChecksum>,
-    /// Where everything stands.
+    /// At which bytes time, eye and pupils stand.
     pub layout: Layout<Field>,
 }
 
@@ -29,7 +29,7 @@ pub struct PacketSettings {
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum PacketLength {
-    /// This many bytes.
+    /// Always this many bytes.
     Fixed(usize),
     /// It tells it itself.
     Told {
@@ -43,14 +43,14 @@ pub enum PacketLength {
     },
 }
 
-/// A packet's checksum.
+/// A packet's checksum: where it stands, and which bytes it covers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PacketChecksum {
     /// What kind of sum it is.
     pub kind: ChecksumKind,
     /// Where it stands; negative where it is counted from the packet's end.
     pub at: i32,
-    /// Highest byte first.
+    /// Whether the highest byte of two comes first.
     pub big_endian: bool,
     /// The first byte that it covers.
     pub from: i32,

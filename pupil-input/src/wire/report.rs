@@ -12,7 +12,7 @@ pub struct ReportSettings {
     pub least: usize,
     /// The most bytes; None where any number may follow.
     pub most: Option<usize>,
-    /// Where everything stands.
+    /// At which bytes time, eye and pupils stand.
     pub layout: Layout<Field>,
 }
 
@@ -26,7 +26,7 @@ pub struct ReportDecoder {
 }
 
 impl ReportDecoder {
-    /// A decoder.
+    /// A decoder of messages as these settings describe them.
     pub fn new(settings: &ReportSettings) -> Self {
         Self {
             id: settings.id,

@@ -9,7 +9,7 @@ use super::{Decoder, WireEvent, WireFault};
 /// A field by what it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct UsageAt {
-    /// What it is.
+    /// What it is for, by page and number.
     pub usage: Usage,
     /// What the innermost collection around it is; None where the usage alone tells the field.
     pub collection: Option<Usage>,
@@ -22,7 +22,7 @@ pub struct UsageAt {
 /// figure, its rules for validity to the raw one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UsageSettings {
-    /// Where everything stands.
+    /// Which usages are time, eye and pupils.
     pub layout: Layout<UsageAt>,
 }
 

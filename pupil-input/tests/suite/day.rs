@@ -17,7 +17,7 @@ const SAMPLE_PERIOD: i64 = S / 120;
 const FRAME_PERIOD: i64 = S / 60;
 /// A frame asks for the pupil so far ahead.
 const AHEAD: i64 = 20 * MS;
-/// One of so many minutes is a bad one.
+/// One minute of this many is a bad one.
 const BAD_EVERY: i64 = 4;
 /// So long after the last trouble all is as if there had been none: the clock model's line forgets in 16 s.
 const SETTLES: i64 = 20 * S;

@@ -124,7 +124,7 @@ pub(crate) fn smi(rate_hz: f64, separator: char, decimal_comma: bool) -> String 
     text
 }
 
-/// Neon `eye_state ps1.raw` and its `.time`; only the lids' distance tells of a blink.
+/// Neon `eye_state ps1.raw` and its `.time`; only the lids' distance shows a blink.
 pub(crate) fn neon_native(rate_hz: f64) -> (Vec<u8>, Vec<u8>) {
     let (mut states, mut times) = (Vec::new(), Vec::new());
     for t_s in instants(rate_hz) {

@@ -419,7 +419,7 @@ fn samples_are_put_to_the_time_of_their_images() {
         while let Some(decision) = handle.decisions.pop() {
             delays_s.push((decision.sample.t_arrival - decision.sample.t_sample).seconds());
         }
-        // Arrival times alone would tell of no delay that all samples have.
+        // Arrival times alone would show no delay that all samples have.
         let newest = &delays_s[delays_s.len().saturating_sub(50)..];
         newest.iter().filter(|delay_s| **delay_s > PHONE_TAKES_MS as f64 * 0.5e-3).count() >= 40
     };

@@ -14,7 +14,7 @@ pub const SIMULATED: &str = "simulated";
 /// The argument of `ARM`, so that no stray byte arms.
 const ARM_TOKEN: &str = "LIGHT";
 
-/// A host's command, one line each.
+/// What a host tells a box or asks it, one line each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Command {
@@ -209,7 +209,7 @@ impl fmt::Display for Refusal {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Answer<'a> {
-    /// To `ID?`: what speaks there.
+    /// The answer to `ID?`: its name, and what it speaks.
     Identity {
         /// Its version of the protocol.
         version: u32,
@@ -221,7 +221,7 @@ pub enum Answer<'a> {
     Sync { t: TimeUs, sync: SyncSeen },
     /// What it is built for.
     Limits { t: TimeUs, limits: Limits },
-    /// To `STAT?`: its state at `t` of its clock.
+    /// The answer to `STAT?`.
     State { t: TimeUs, state: State },
 }
 
@@ -247,7 +247,7 @@ pub enum Message<'a> {
         number: u32,
         refusal: Refusal,
     },
-    /// It has booted, dark and without a program: what a host had set is gone.
+    /// It has booted: dark, and without settings.
     Booted,
     /// It went dark by itself.
     Dark { t: TimeUs, reason: DarkReason },

@@ -44,7 +44,7 @@ pub trait Hardware {
     fn feed_watchdog(&mut self);
 }
 
-/// A box: takes lines of the protocol in and lights lasers on `hardware`.
+/// A box's program on its board: lines in, gates and answers out.
 #[derive(Debug)]
 pub struct Controller<H> {
     hardware: H,
@@ -67,12 +67,12 @@ impl<H: Hardware> Controller<H> {
         controller
     }
 
-    /// What may be lit, and why it may not.
+    /// What decides when a laser is lit.
     pub fn machine(&self) -> &Machine {
         &self.machine
     }
 
-    /// The board that it was made with: pins, clock and line.
+    /// The board that the program runs on.
     pub fn hardware_mut(&mut self) -> &mut H {
         &mut self.hardware
     }

@@ -23,5 +23,5 @@ pub use line::{Line, LineBuffer};
 pub use machine::{Event, Machine};
 pub use types::{DarkReason, FIELDS_MAX, Laser, Limits, Sequence, State, SyncSeen, TimeUs, Trigger, Window};
 
-/// The version of the protocol that is spoken here; a host refuses a box of another one.
+/// The version of the protocol that a box names and a host asks for.
 pub const PROTOCOL_VERSION: u32 = 3;

@@ -16,7 +16,7 @@ pub const AHEAD_MAX_US: u32 = 1_000_000;
 /// Colour frames that a box takes, microseconds.
 pub const PERIOD_US: core::ops::RangeInclusive<u32> = 500..=1_000_000;
 
-/// What changed at the lasers, with the box's time of it.
+/// What happened at a box, at `t` of its clock.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Event {
@@ -139,7 +139,7 @@ impl Machine {
         self.settings.power_uw.filter(|_| self.is_armed()).unwrap_or_default()
     }
 
-    /// What a host is told of it: armed or why not, what is lit, interlock and sync wire.
+    /// What it answers when it is asked for its state.
     pub fn state(&self) -> State {
         State {
             armed: self.is_armed(),

@@ -7,7 +7,7 @@ use core::fmt::{self, Write as _};
 pub struct TimeUs(pub u64);
 
 impl TimeUs {
-    /// This time and `span_us` microseconds; at the end of the clock it stands still.
+    /// The time `span_us` microseconds later, the last one at most.
     #[must_use]
     pub const fn after(self, span_us: u32) -> Self {
         Self(self.0.saturating_add(span_us as u64))
@@ -23,11 +23,11 @@ impl TimeUs {
 /// One of the three lasers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Laser {
-    /// `R` on the line.
+    /// The red one, R on the line.
     Red,
-    /// `G` on the line.
+    /// The green one, G on the line.
     Green,
-    /// `B` on the line.
+    /// The blue one, B on the line.
     Blue,
 }
 
@@ -35,7 +35,7 @@ impl Laser {
     /// All lasers, in the order in which figures for each of them are given.
     pub const ALL: [Self; 3] = [Self::Red, Self::Green, Self::Blue];
 
-    /// Its place in [`Self::ALL`] and in arrays of three figures.
+    /// Its place in [`Self::ALL`], and of its figure among three.
     pub const fn index(self) -> usize {
         self as usize
     }
@@ -114,7 +114,7 @@ impl Sequence {
         Self::new(text.chars().filter_map(Laser::from_letter))
     }
 
-    /// One laser for each field of the colour frame, in the order in which they are shown.
+    /// The lasers in the order in which their fields follow one another.
     pub fn lasers(&self) -> &[Laser] {
         &self.lasers[..self.count]
     }
@@ -146,7 +146,7 @@ pub struct Limits {
 pub struct SyncSeen {
     /// How many; it wraps round.
     pub count: u32,
-    /// When the last edge came, on the box's clock; nothing before the first.
+    /// When the last one came, by the box's clock; none before the first.
     pub t_last: Option<TimeUs>,
 }
 
@@ -174,7 +174,7 @@ macro_rules! dark_reasons {
         }
 
         impl DarkReason {
-            /// Every reason, those of a box first.
+            /// Every reason, in the order in which they are counted.
             pub const ALL: [Self; [$($name),*].len()] = [$(Self::$variant),*];
 
             /// The name in files, logs and on the line.

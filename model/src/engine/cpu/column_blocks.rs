@@ -29,7 +29,7 @@ impl ColumnBlocks {
         Self::new(planes, 2, size, set)
     }
 
-    /// Values of so many real planes.
+    /// Values of this many real planes.
     pub(super) fn room_for_reals(planes: usize, size: Resolution, set: InstructionSet) -> usize {
         values_of(planes, 1, size, set)
     }

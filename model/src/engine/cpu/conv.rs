@@ -43,7 +43,7 @@ pub(super) struct Activation {
 }
 
 impl Activation {
-    /// Room for so many channels, in whole vectors; all biases are zero.
+    /// For `channels` channels, in whole vectors; all biases are zero.
     pub(super) fn new(channels: usize, epilogue: Epilogue, leaky_slope: f32) -> Self {
         Self { scale: vec![1.0; channels], bias: vec![0.0; channels], epilogue, leaky_slope }
     }

@@ -7,7 +7,7 @@ use crate::simd::InstructionSet;
 
 /// Side of the squares of pixels that a layer computes together.
 pub(super) const TILE: usize = 4;
-/// Rows of a band: so many of one block of columns lie together in the cache.
+/// Rows of a band: those of one block of columns lie together in the cache.
 pub(super) const BAND: usize = 16;
 
 /// A feature map [height, width, channels] with a border of zeros: one pixel before, and after as many as fill the last

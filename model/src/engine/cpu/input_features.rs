@@ -28,7 +28,7 @@ pub(super) fn sample_pitch(bench: &DisplayGeometry) -> Metres {
 /// Which channels of the map that both nets read are what.
 #[derive(Clone, Copy)]
 pub(super) struct InputChannels {
-    /// So many, the first ones, are told to both nets.
+    /// How many of them, the first ones, are told to both nets.
     pub(super) told: usize,
     /// From here on what the second net alone reads: the field, three real parts and three imaginary ones, its change
     /// likewise, and three colours of each plane of what is lacking. Nothing but zeros lies between what is told and

@@ -41,7 +41,7 @@ impl Squares<'_> {
 
 /// A complex number in each lane.
 type Cell<S> = [<S as Simd>::Vector; 2];
-/// [cos, sin] of minus so many parts of a turn.
+/// [cos, sin] of minus a part of a turn.
 type Turn = [f32; 2];
 
 /// A transform of lines of one length.
@@ -66,7 +66,7 @@ struct Pass {
     stride: usize,
     /// Turns of a group's butterflies but for its first sample, [group, sample].
     turns: Vec<Turn>,
-    /// So many parts of a turn as the radix has samples.
+    /// A turn in as many parts as the radix has samples.
     circle: [Turn; MOST_RADIX],
 }
 

@@ -162,7 +162,7 @@ impl FocalStackEngine {
         Ok(())
     }
 
-    /// As [`CpuEngine::instruction_set`].
+    /// Which instruction set the kernels use, by the names of [`CpuEngine::instruction_set`].
     pub fn instruction_set(&self) -> &'static str {
         self.products.name()
     }

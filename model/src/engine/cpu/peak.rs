@@ -13,10 +13,10 @@ const MEASURED: Duration = Duration::from_millis(200);
 /// Independent chains of multiply-adds: enough to hide the latency of two units on every processor in sight.
 const CHAINS: usize = 12;
 const STEPS_PER_ROUND: usize = 20_000;
-/// So often both are timed to decide on half precision, and so many times faster it must be at least.
+/// How often both are timed to decide on half precision, and how many times faster it must be at least.
 const HALF_ROUNDS: usize = 20;
 const HALF_GAIN: f64 = 1.25;
-/// A stream's buffers are so many times the last-level caches, within these limits.
+/// How many times the last-level caches a stream's buffers are, within these limits.
 const TIMES_CACHES: u64 = 4;
 const STREAM_BYTES_MIN: u64 = 256 << 20;
 const STREAM_BYTES_MAX: u64 = 1 << 30;

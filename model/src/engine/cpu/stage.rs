@@ -102,8 +102,8 @@ impl Maps {
         MapId(self.maps.len() - 1)
     }
 
-    /// Two maps that the layers of a net hand on by turns. All nets of so many channels share them: each has made its
-    /// output when the next one begins.
+    /// Two maps that the layers of a net hand on by turns. All nets of one number of channels share them: each has made
+    /// its output when the next one begins.
     pub(super) fn handed_on(&mut self, channels: usize) -> [MapId; 2] {
         if let Some((_, maps)) = self.handed_on.iter().find(|(of, _)| *of == channels) {
             return *maps;

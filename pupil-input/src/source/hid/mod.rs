@@ -232,11 +232,11 @@ impl ByteSource for HidSource {
 pub struct HidDeviceInfo {
     /// Its device node, such as `/dev/hidraw0`.
     pub path: PathBuf,
-    /// Vendor and product.
+    /// USB vendor and product.
     pub ids: UsbIds,
     /// Serial number; empty where the maker gave it none.
     pub serial: String,
-    /// The product's name.
+    /// The product's name, as the device gives it.
     pub product: String,
 }
 

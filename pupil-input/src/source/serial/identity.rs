@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use crate::usb_ids::UsbIds;
 
-/// A serial port.
+/// A serial port of this machine, as far as the kernel tells what is behind it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SerialPortInfo {
     /// Its device node, such as `/dev/ttyUSB0`.
@@ -16,7 +16,7 @@ pub struct SerialPortInfo {
     pub by_id: Option<PathBuf>,
     /// What is plugged in, if it is a USB device.
     pub usb: Option<UsbPort>,
-    /// The kernel's driver.
+    /// Name of the kernel's driver, such as `ftdi_sio`.
     pub driver: Option<String>,
     /// How long the adapter holds bytes back, ms; FTDI's chips have such a timer.
     pub latency_timer_ms: Option<u32>,
@@ -25,13 +25,13 @@ pub struct SerialPortInfo {
 /// The USB device behind a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UsbPort {
-    /// Vendor and product.
+    /// USB vendor and product.
     pub ids: UsbIds,
     /// Serial number, where the maker gave it one.
     pub serial: Option<String>,
-    /// The maker's name.
+    /// The maker's name, where the device gives one.
     pub manufacturer: Option<String>,
-    /// The product's name.
+    /// The product's name, where the device gives one.
     pub product: Option<String>,
     /// Which of the device's interfaces: adapters with several ports have several.
     pub interface: Option<String>,

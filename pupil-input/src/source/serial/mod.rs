@@ -67,7 +67,7 @@ pub enum SerialError {
     Command { path: PathBuf, profile: String, problem: Box<CommandError> },
 }
 
-/// How long a port is listened to before anything is written to a device that nothing else tells of.
+/// How long a port is listened to before anything is written to a device that nothing else identifies.
 const LISTENS: Duration = Duration::from_millis(300);
 /// How long a closing port waits for its last bytes to go out.
 const DRAINS: Duration = Duration::from_millis(300);

@@ -27,7 +27,7 @@ const MAX_LINE_BYTES: usize = 2048;
 pub enum PupilExtContainer {
     /// Rows with this ASCII character between columns.
     Csv { delimiter: u8 },
-    /// Objects.
+    /// JSON objects, one a frame.
     Json,
 }
 
@@ -46,7 +46,7 @@ pub enum PupilExtSize {
 /// Which eyes PupilEXT looks at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PupilExtEyes {
-    /// One: this.
+    /// One: this, or the one that the message names where this is [`SampleEye::Both`].
     One(SampleEye),
     /// Two; its `A` is the right one.
     Two,
@@ -59,7 +59,7 @@ pub struct PupilExtSettings {
     pub container: PupilExtContainer,
     /// The eyes it looks at.
     pub eyes: PupilExtEyes,
-    /// Two cameras.
+    /// Whether two cameras look at each eye, so that a message has two views of it.
     pub stereo: bool,
     /// The size that is read.
     pub size: PupilExtSize,
