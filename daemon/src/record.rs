@@ -34,7 +34,7 @@ pub(crate) struct FieldRecord {
     pub colour: Colour,
     /// When the field appeared on the panel.
     pub t_present: TimeNs,
-    pub provenance: &'static str,
+    pub timestamp_source: &'static str,
     /// The laser's lit window, where it was lit.
     pub laser_window: Option<(TimeNs, TimeNs)>,
     /// This is the first time that the panel shows this frame, and it is later than planned.
@@ -49,7 +49,7 @@ impl FieldRecord {
             field: event.field as u8,
             colour: event.colour,
             t_present: event.t_present,
-            provenance: event.provenance.name(),
+            timestamp_source: event.timestamp_source.name(),
             laser_window: event.laser_on.zip(event.laser_off),
             deadline_missed: event.deadline_missed && !event.repeated,
         }

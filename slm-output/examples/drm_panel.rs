@@ -347,7 +347,8 @@ fn sleep_until(presenter: &DrmPanel) -> io::Result<()> {
 
 fn report(notes: &mut Notes, presenter: &DrmPanel, layout: FrameLayout) {
     // The first refreshes are those that make the clock believed.
-    let begin = notes.refreshes.iter().position(|refresh| refresh.provenance == TimestampSource::Hardware).unwrap_or(0);
+    let begin =
+        notes.refreshes.iter().position(|refresh| refresh.timestamp_source == TimestampSource::Hardware).unwrap_or(0);
     let believed = &notes.refreshes[begin..];
     let pairs = || believed.windows(2).map(|pair| (&pair[0], &pair[1]));
     let intervals_us = || pairs().map(|(a, b)| (b.t_present - a.t_present).0 / 1000);
@@ -366,7 +367,7 @@ fn report(notes: &mut Notes, presenter: &DrmPanel, layout: FrameLayout) {
     tell(&json!({
         "refreshes": notes.refreshes.len(),
         "before_believed": begin,
-        "hardware": believed.iter().filter(|refresh| refresh.provenance == TimestampSource::Hardware).count(),
+        "hardware": believed.iter().filter(|refresh| refresh.timestamp_source == TimestampSource::Hardware).count(),
         "repeated": believed.iter().filter(|refresh| refresh.repeated).count(),
         "not_counted_on_by_one": pairs().filter(|(a, b)| !counted(a, b)).count(),
         "not_the_next_field_of_the_next_frame": pairs().filter(|(a, b)| !follows(a, b)).count(),

@@ -60,7 +60,7 @@ fn decisions(rig: &Rig) -> (i64, f64) {
             field: index as usize % layout.refreshes() * layout.fields_per_refresh(),
             repeated: false,
             t_present,
-            provenance: TimestampSource::Hardware,
+            timestamp_source: TimestampSource::Hardware,
             refresh_count: Some(index as u64),
         };
         scheduler.on_refresh(&refresh);

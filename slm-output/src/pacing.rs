@@ -175,7 +175,7 @@ impl Pacer {
 
     /// The panel says that `frame_id` was first shown at `t_present`. Reports may come late, early, twice, in any
     /// order, with a time of zero or of frames that are unknown; what cannot be is ignored.
-    pub fn report(&mut self, frame_id: u64, t_present: TimeNs, provenance: TimestampSource) {
+    pub fn report(&mut self, frame_id: u64, t_present: TimeNs, timestamp_source: TimestampSource) {
         let Some(slot) = self.slots[slot_index(frame_id)].as_mut().filter(|slot| slot.awaits_report(frame_id)) else {
             return;
         };
@@ -187,7 +187,7 @@ impl Pacer {
         }
         slot.reported = true;
         let slot = *slot;
-        if provenance != TimestampSource::Estimated {
+        if timestamp_source != TimestampSource::Estimated {
             self.clock.observe(t_present);
             self.learn_lead(&slot, t_present);
         }
@@ -206,9 +206,9 @@ impl Pacer {
     }
 
     /// The panel refreshed at `t_refresh` with whatever it had: keeps its clock true while frames are rare.
-    pub fn observe_refresh(&mut self, t_refresh: TimeNs, provenance: TimestampSource) {
+    pub fn observe_refresh(&mut self, t_refresh: TimeNs, timestamp_source: TimestampSource) {
         let possible = t_refresh > TimeNs(0) && t_refresh.0 < i64::MAX / 4;
-        if provenance != TimestampSource::Estimated && possible {
+        if timestamp_source != TimestampSource::Estimated && possible {
             self.clock.observe(t_refresh);
         }
     }
@@ -746,14 +746,14 @@ mod tests {
     enum Step {
         Predict { later_ns: i64 },
         Mark { back: u64, later_ns: i64 },
-        Report { back: u64, t_ns: i64, provenance: TimestampSource },
+        Report { back: u64, t_ns: i64, timestamp_source: TimestampSource },
         Refresh { t_ns: i64 },
     }
 
     fn steps() -> impl Strategy<Value = Step> {
         let odd_times =
             prop_oneof![Just(0), Just(-1), Just(i64::MAX), Just(i64::MIN), 0i64..2_000_000_000, any::<i64>()];
-        let provenance = prop_oneof![
+        let timestamp_source = prop_oneof![
             Just(TimestampSource::Hardware),
             Just(TimestampSource::Software),
             Just(TimestampSource::Estimated)
@@ -761,8 +761,8 @@ mod tests {
         prop_oneof![
             4 => (0i64..40 * MS).prop_map(|later_ns| Step::Predict { later_ns }),
             4 => (0u64..20, 0i64..60 * MS).prop_map(|(back, later_ns)| Step::Mark { back, later_ns }),
-            4 => (0u64..20, odd_times.clone(), provenance)
-                .prop_map(|(back, t_ns, provenance)| Step::Report { back, t_ns, provenance }),
+            4 => (0u64..20, odd_times.clone(), timestamp_source)
+                .prop_map(|(back, t_ns, timestamp_source)| Step::Report { back, t_ns, timestamp_source }),
             1 => odd_times.prop_map(|t_ns| Step::Refresh { t_ns }),
         ]
     }
@@ -797,9 +797,9 @@ mod tests {
                         pacer.submitted(id, now + TimeNs(later_ns));
                         last_submitted |= last.is_some() && back == 0;
                     }
-                    Step::Report { back, t_ns, provenance } => {
+                    Step::Report { back, t_ns, timestamp_source } => {
                         let id = last.map_or(0, |last| last.frame_id).wrapping_sub(back);
-                        pacer.report(id, TimeNs(t_ns), provenance);
+                        pacer.report(id, TimeNs(t_ns), timestamp_source);
                     }
                     Step::Refresh { t_ns } => pacer.observe_refresh(TimeNs(t_ns), TimestampSource::Hardware),
                 }

@@ -139,7 +139,7 @@ fn a_frame_from_phase_to_light_takes_no_memory() {
                         .tick(now, &mut source, &mut |refresh| {
                             scheduler.on_refresh(&refresh);
                             if let Some(frame) = refresh.frame {
-                                pacer.report(frame.frame_id, refresh.t_present, refresh.provenance);
+                                pacer.report(frame.frame_id, refresh.t_present, refresh.timestamp_source);
                             }
                         })
                         .unwrap();

@@ -249,7 +249,7 @@ mod tests {
             t_present: TimeNs(1),
             t_settled: TimeNs(2),
             t_end: TimeNs(3),
-            provenance: TimestampSource::Software,
+            timestamp_source: TimestampSource::Software,
             laser_on: None,
             laser_off: None,
             dark: None,

@@ -336,7 +336,7 @@ mod tests {
                 t_present,
                 t_settled: t_present,
                 t_end: ms(t_ms),
-                provenance: TimestampSource::Software,
+                timestamp_source: TimestampSource::Software,
                 laser_on: is_lit.then_some(t_present),
                 laser_off: is_lit.then_some(ms(t_ms)),
                 dark: (!is_lit).then_some(DarkReason::Late),

@@ -38,7 +38,7 @@ const COLUMNS: [(&str, Cell); 27] = [
     ("t_render_end_ns", Frame(|frame| Some(nanoseconds(frame.t_render_end)))),
     ("t_submit_ns", Frame(|frame| Some(nanoseconds(frame.t_submit)))),
     ("t_present_ns", Field(|field| nanoseconds(field.t_present))),
-    ("present_provenance", Field(|field| field.provenance.into())),
+    ("present_provenance", Field(|field| field.timestamp_source.into())),
     ("laser_on_ns", Field(|field| field.laser_window.map_or_else(String::new, |(on, _)| nanoseconds(on)))),
     ("laser_off_ns", Field(|field| field.laser_window.map_or_else(String::new, |(_, off)| nanoseconds(off)))),
     ("deadline_missed", Field(|field| u8::from(field.deadline_missed).to_string())),
@@ -238,7 +238,7 @@ mod tests {
             field: 1,
             colour: Colour::Green,
             t_present: TimeNs(30),
-            provenance: "software",
+            timestamp_source: "software",
             laser_window: Some((TimeNs(33), TimeNs(36))),
             deadline_missed: false,
         }

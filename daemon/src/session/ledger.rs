@@ -137,7 +137,7 @@ mod tests {
             t_present: t,
             t_settled: t + TimeNs(100),
             t_end: t + TimeNs(1000),
-            provenance: TimestampSource::Software,
+            timestamp_source: TimestampSource::Software,
             laser_on: Some(t + TimeNs(200)),
             laser_off: Some(t + TimeNs(900)),
             dark: None,

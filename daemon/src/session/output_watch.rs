@@ -103,7 +103,7 @@ impl OutputWatch {
     /// Takes note of a field that is over. What to say, once until the panel is lost and back, where most fields stay
     /// dark for a reason that nobody asked for.
     pub(super) fn judge_field(&mut self, field: &FieldEvent) -> Option<String> {
-        self.are_times_good = match field.provenance {
+        self.are_times_good = match field.timestamp_source {
             TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => true,
             TimestampSource::Software => self.takes_software_times,
             TimestampSource::Estimated => false,
@@ -123,11 +123,11 @@ impl OutputWatch {
         self.said.push(reason);
         Some(match reason {
             DarkReason::Untrusted if is_all => {
-                let why = self.why_unbelieved(field.provenance);
+                let why = self.why_unbelieved(field.timestamp_source);
                 format!("no report of the panel's refreshes is believed, so lasers stay dark: {why}")
             }
             DarkReason::Untrusted => {
-                let why = self.why_unbelieved(field.provenance);
+                let why = self.why_unbelieved(field.timestamp_source);
                 format!("few reports of the panel's refreshes are believed, so lasers flicker: {why}")
             }
             reason => {
@@ -137,8 +137,8 @@ impl OutputWatch {
         })
     }
 
-    fn why_unbelieved(&self, provenance: TimestampSource) -> String {
-        match provenance {
+    fn why_unbelieved(&self, timestamp_source: TimestampSource) -> String {
+        match timestamp_source {
             // No window of the rig's switches these lasers, so that none of its figures leaves more room.
             TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External if !self.gates_fields => {
                 "their times scatter by more than 1/16 of a refresh; `holod check` says what an output is good for".into()
@@ -243,7 +243,7 @@ mod tests {
     }
 
     /// The field of this number, of 180 a second.
-    fn field(index: i64, provenance: TimestampSource, dark: Option<DarkReason>) -> FieldEvent {
+    fn field(index: i64, timestamp_source: TimestampSource, dark: Option<DarkReason>) -> FieldEvent {
         let t_present = TimeNs(index * 5_555_556);
         FieldEvent {
             frame_id: index as u64 / 3,
@@ -254,7 +254,7 @@ mod tests {
             t_present,
             t_settled: t_present,
             t_end: t_present,
-            provenance,
+            timestamp_source,
             laser_on: dark.is_none().then_some(t_present),
             laser_off: dark.is_none().then_some(t_present),
             dark,
@@ -271,13 +271,13 @@ mod tests {
 
     #[test]
     fn another_rate_is_told_once_and_only_of_times_by_which_lasers_are_lit() {
-        for (provenance, takes_software_times, told) in [
+        for (timestamp_source, takes_software_times, told) in [
             (TimestampSource::Driver, false, 1),
             (TimestampSource::Software, false, 0),
             (TimestampSource::Software, true, 1),
         ] {
             let mut watch = OutputWatch { takes_software_times, ..watch() };
-            watch.judge_field(&field(0, provenance, Some(DarkReason::Untrusted)));
+            watch.judge_field(&field(0, timestamp_source, Some(DarkReason::Untrusted)));
             // A rate that crosses the tolerance again and again, as measured.
             let rates = (0..60).map(|second| if second % 6 == 5 { 60.0 } else { 58.3 + 0.1 * f64::from(second % 3) });
             let said = rates.zip(0..).filter_map(|(hz, second)| watch.judge_rate(hz, TimeNs(second * 1_000_000_000)));

@@ -168,7 +168,7 @@ mod tests {
             t_present,
             t_settled: t_present,
             t_end: t_present + TimeNs(10_000),
-            provenance: TimestampSource::Software,
+            timestamp_source: TimestampSource::Software,
             laser_on: is_lit.then_some(t_present + TimeNs(2_000)),
             laser_off: is_lit.then_some(t_present + TimeNs(8_000)),
             dark: (!is_lit).then_some(DarkReason::Late),

@@ -34,7 +34,7 @@ pub struct FieldEvent {
     /// When it made way for the next one.
     pub t_end: TimeNs,
     /// Where `t_present` comes from.
-    pub provenance: TimestampSource,
+    pub timestamp_source: TimestampSource,
     /// The on edge of its laser, if it was lit and the box tells edges.
     pub laser_on: Option<TimeNs>,
     /// The off edge of its laser, likewise.
@@ -192,7 +192,7 @@ impl Ledger {
             t_present: field.t_present,
             t_settled: field.t_present + self.gate.settle(),
             t_end,
-            provenance: field.provenance,
+            timestamp_source: field.timestamp_source,
             laser_on: on.map(|edge| edge.t),
             laser_off: off.map(|edge| edge.t),
             dark: match (on, dark) {

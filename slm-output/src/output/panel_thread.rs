@@ -79,7 +79,7 @@ impl PanelThread {
             let report = refresh.frame.filter(|_| refresh.field == 0).map(|frame| PresentReport {
                 frame_id: frame.frame_id,
                 t_present: refresh.t_present,
-                provenance: refresh.provenance,
+                timestamp_source: refresh.timestamp_source,
                 repeated: refresh.repeated,
             });
             if report.is_some_and(|report| reports.push(report).is_err()) {

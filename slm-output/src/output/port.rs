@@ -15,7 +15,7 @@ pub struct PresentReport {
     /// Host time at which its first field came on the panel.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
-    pub provenance: TimestampSource,
+    pub timestamp_source: TimestampSource,
     /// The frame had been shown before.
     pub repeated: bool,
 }
@@ -49,9 +49,9 @@ impl FramePort {
     pub fn feed(&mut self, pacer: &mut Pacer, mut report: impl FnMut(PresentReport)) {
         while let Ok(presented) = self.reports.pop() {
             if presented.repeated {
-                pacer.observe_refresh(presented.t_present, presented.provenance);
+                pacer.observe_refresh(presented.t_present, presented.timestamp_source);
             } else {
-                pacer.report(presented.frame_id, presented.t_present, presented.provenance);
+                pacer.report(presented.frame_id, presented.t_present, presented.timestamp_source);
             }
             report(presented);
         }

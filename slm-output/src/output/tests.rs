@@ -228,7 +228,7 @@ fn nothing_is_lit_over_the_flat_pattern_or_before_the_first_frame() {
 fn times_that_nobody_saw_light_nothing() {
     for mode in MODES {
         let mut bench = Bench::new(mode);
-        bench.falsify = |refresh| Some(PresentedRefresh { provenance: TimestampSource::Estimated, ..refresh });
+        bench.falsify = |refresh| Some(PresentedRefresh { timestamp_source: TimestampSource::Estimated, ..refresh });
         bench.run(TimeNs(500 * MS), TimeNs(0));
         assert_eq!(bench.edges, []);
         // Of a real panel, software's word is not enough either.
@@ -242,7 +242,7 @@ fn times_that_nobody_saw_light_nothing() {
             "{}",
             events.len()
         );
-        bench.falsify = |refresh| Some(PresentedRefresh { provenance: TimestampSource::Hardware, ..refresh });
+        bench.falsify = |refresh| Some(PresentedRefresh { timestamp_source: TimestampSource::Hardware, ..refresh });
         bench.run(TimeNs(1000 * MS), TimeNs(0));
         assert_ne!(bench.edges, []);
     }
@@ -543,7 +543,7 @@ impl Reporter {
                 field,
                 repeated: field > 0,
                 t_present,
-                provenance: TimestampSource::Software,
+                timestamp_source: TimestampSource::Software,
                 refresh_count: None,
             };
             self.news.push(PanelNews::Refresh(refresh)).expect("the laser thread reads them");

@@ -203,7 +203,7 @@ impl Presenter for HeadlessPanel {
                     field: self.next_refresh * self.fields_per_refresh,
                     repeated: self.repeated && self.frame.is_some(),
                     t_present: self.t_next,
-                    provenance: TimestampSource::Software,
+                    timestamp_source: TimestampSource::Software,
                     refresh_count: Some(self.refresh_count),
                 };
                 self.report(refresh, presented);

@@ -97,7 +97,7 @@ pub struct PresentedRefresh {
     /// When the pattern came on the panel.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
-    pub provenance: TimestampSource,
+    pub timestamp_source: TimestampSource,
     /// The display controller's own count of refreshes, where it has one.
     pub refresh_count: Option<u64>,
 }

@@ -185,7 +185,7 @@ mod tests {
                 field: 1,
                 colour: Colour::Blue,
                 t_present: TimeNs(100 * MS),
-                provenance: TimestampSource::Hardware,
+                timestamp_source: TimestampSource::Hardware,
                 repeated: false,
                 reported: true,
             };

@@ -24,8 +24,8 @@ pub enum Evidence {
 }
 
 impl Evidence {
-    fn accepts(self, provenance: TimestampSource) -> bool {
-        match provenance {
+    fn accepts(self, timestamp_source: TimestampSource) -> bool {
+        match timestamp_source {
             TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => true,
             TimestampSource::Software => self == Self::Seen,
             TimestampSource::Estimated => false,
@@ -200,7 +200,7 @@ impl Interlock {
         if let Some(reason) = self.held {
             return Err(reason);
         }
-        if !self.evidence.accepts(field.provenance) {
+        if !self.evidence.accepts(field.timestamp_source) {
             return Err(DarkReason::Untrusted);
         }
         verdict?;

@@ -38,7 +38,7 @@ pub struct ShownField {
     /// When the pattern came on the panel.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
-    pub provenance: TimestampSource,
+    pub timestamp_source: TimestampSource,
     /// Whether the frame had been shown before, because no newer one was there in time.
     pub repeated: bool,
     /// Whether the panel reported this field itself; the panel's sequencer shows the others after it.
@@ -225,7 +225,7 @@ impl FieldScheduler {
             field,
             colour,
             t_present: TimeNs(refresh.t_present.0 + decided as i64 * self.gate.timing().field_period.0),
-            provenance: refresh.provenance,
+            timestamp_source: refresh.timestamp_source,
             repeated: refresh.repeated,
             reported: decided == 0,
         };

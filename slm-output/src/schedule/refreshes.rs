@@ -264,7 +264,7 @@ mod tests {
             field: 0,
             repeated: false,
             t_present: TimeNs(t),
-            provenance: TimestampSource::Hardware,
+            timestamp_source: TimestampSource::Hardware,
             refresh_count,
         }
     }

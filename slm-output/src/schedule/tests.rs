@@ -102,7 +102,7 @@ fn run_with(rig: &Rig, mut scheduler: FieldScheduler, steps: &[Step]) -> Ran {
             field,
             repeated: field > 0,
             t_present: t_true + TimeNs(step.jitter_ns - step.early_ns),
-            provenance: TimestampSource::Hardware,
+            timestamp_source: TimestampSource::Hardware,
             refresh_count: None,
         };
         let t_told = t_true + TimeNs(step.delay_ns);

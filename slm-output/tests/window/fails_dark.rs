@@ -53,7 +53,7 @@ impl Presenter for Stamped {
         presented: &mut dyn FnMut(PresentedRefresh),
     ) -> Result<(), PanelFault> {
         self.0.tick(now, frames, &mut |refresh| {
-            presented(PresentedRefresh { provenance: TimestampSource::Driver, ..refresh });
+            presented(PresentedRefresh { timestamp_source: TimestampSource::Driver, ..refresh });
         })
     }
 

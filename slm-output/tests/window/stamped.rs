@@ -64,7 +64,7 @@ fn a_time_is_reported_for_the_picture_that_was_scanned_out_then() {
         let compositor = StampingCompositor::start(Manner { told_after, ..Manner::default() });
         let mut bench = open(&compositor, mode);
         let reports = reports(&mut bench);
-        assert!(reports.iter().all(|report| report.provenance == TimestampSource::Driver), "{reports:?}");
+        assert!(reports.iter().all(|report| report.timestamp_source == TimestampSource::Driver), "{reports:?}");
         let mut flips = compositor.flips();
         let [found, judged] = wrong(&reports, &flips, mode);
         assert!(found == 0 && judged >= 100, "{mode:?}: {found} of {judged} are wrong");
@@ -102,7 +102,7 @@ fn of_a_compositor_that_tells_no_times_pictures_are_shown_in_its_rhythm_and_none
         let compositor = StampingCompositor::start(Manner { times, ..Manner::default() });
         let mut bench = open(&compositor, PanelMode::ChannelPacked);
         let reports = reports(&mut bench);
-        assert!(reports.iter().all(|report| report.provenance == TimestampSource::Software), "{times:?}");
+        assert!(reports.iter().all(|report| report.timestamp_source == TimestampSource::Software), "{times:?}");
         let mut apart: Vec<_> = reports.windows(2).map(|pair| pair[1].t_present - pair[0].t_present).collect();
         let mean_ms = apart.iter().map(|apart| apart.0).sum::<i64>() as f64 / 1e6 / apart.len() as f64;
         apart.sort();

@@ -80,7 +80,7 @@ fn refreshes_have_the_servers_times_which_a_copy_does_not_make_the_drivers() {
     let mut bench = open(&desktop, &named(PANEL), PanelMode::ChannelPacked).unwrap();
     bench.submit();
     let refreshes = bench.run_for(61).unwrap();
-    assert!(refreshes.iter().all(|refresh| refresh.provenance == TimestampSource::Software));
+    assert!(refreshes.iter().all(|refresh| refresh.timestamp_source == TimestampSource::Software));
     let counts: Vec<_> = refreshes.iter().filter_map(|refresh| refresh.refresh_count).collect();
     assert_eq!(counts.len(), refreshes.len());
     assert!(counts.is_sorted_by(|a, b| a < b), "{counts:?}");

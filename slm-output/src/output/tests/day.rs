@@ -268,7 +268,7 @@ impl Day {
             field,
             repeated: !new,
             t_present,
-            provenance: TimestampSource::Hardware,
+            timestamp_source: TimestampSource::Hardware,
             refresh_count: None,
         };
         self.tell(PanelNews::Refresh(refresh));

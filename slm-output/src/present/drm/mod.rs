@@ -211,7 +211,7 @@ impl DrmPanel {
             self.margin.missed();
         }
         self.t_choose = self.margin.t_choose(refresh.t_present + self.period).max(t_sent);
-        if refresh.provenance != TimestampSource::Hardware {
+        if refresh.timestamp_source != TimestampSource::Hardware {
             // Of two flips within half a refresh the clock takes the second for the first one's event, once more.
             self.t_choose = self.t_choose.max(TimeNs(refresh.t_present.0 + 5 * self.period.0 / 8));
         }
@@ -223,7 +223,7 @@ impl DrmPanel {
             field: picture.refresh * self.flat.layout().fields_per_refresh(),
             repeated: picture.repeated,
             t_present: refresh.t_present,
-            provenance: refresh.provenance,
+            timestamp_source: refresh.timestamp_source,
             refresh_count: refresh.refresh_count,
         });
         self.report_held(now, presented);

@@ -33,7 +33,7 @@ pub struct Refresh {
     pub t_present: TimeNs,
     /// [`TimestampSource::Hardware`] where the event is believed; [`TimestampSource::Estimated`] where it is not but
     /// earlier ones tell the time; [`TimestampSource::Software`] where only the event's arrival is known.
-    pub provenance: TimestampSource,
+    pub timestamp_source: TimestampSource,
     /// The display controller's counter, widened to 64 bits; `None` where the event is not believed.
     pub refresh_count: Option<u64>,
     /// Refreshes since the previous flip on which the previous picture stayed, where that is known.
@@ -153,7 +153,7 @@ impl FlipClock {
                 self.candidate = None;
                 return Some(Refresh {
                     t_present: stamp.t,
-                    provenance: TimestampSource::Hardware,
+                    timestamp_source: TimestampSource::Hardware,
                     refresh_count: Some(count),
                     missed: refreshes - 1,
                 });
@@ -189,7 +189,12 @@ impl FlipClock {
             self.trusted = Some(anchor);
             self.candidate = None;
             let refresh_count = Some(anchor.count);
-            return Some(Refresh { t_present: stamp.t, provenance: TimestampSource::Hardware, refresh_count, missed });
+            return Some(Refresh {
+                t_present: stamp.t,
+                timestamp_source: TimestampSource::Hardware,
+                refresh_count,
+                missed,
+            });
         }
         self.candidate = Some((anchor, agreeing));
         let Some(trusted) = self.trusted else { return self.by_arrival(now) };
@@ -200,7 +205,7 @@ impl FlipClock {
         if self.t_last.is_some_and(|t_last| t_present <= t_last) {
             t_present = TimeNs(self.t_last.map_or(0, |t_last| t_last.0) + self.period.0);
         }
-        Some(Refresh { t_present, provenance: TimestampSource::Estimated, refresh_count: None, missed: 0 })
+        Some(Refresh { t_present, timestamp_source: TimestampSource::Estimated, refresh_count: None, missed: 0 })
     }
 
     /// What is known where the event's own figures are worth nothing: that it came. A second one within half a refresh
@@ -210,7 +215,7 @@ impl FlipClock {
             self.faults.doubled += 1;
             return None;
         }
-        Some(Refresh { t_present: now, provenance: TimestampSource::Software, refresh_count: None, missed: 0 })
+        Some(Refresh { t_present: now, timestamp_source: TimestampSource::Software, refresh_count: None, missed: 0 })
     }
 
     /// Now and then an event waits long for its reader; where all do, their clock is another one.
@@ -278,14 +283,14 @@ mod tests {
     #[test]
     fn three_events_that_agree_are_believed() {
         let mut clock = clock();
-        let provenances: Vec<_> = (0..4)
+        let timestamp_sources: Vec<_> = (0..4)
             .map(|refresh| {
                 let (stamp, now) = event(7, refresh);
-                clock.judge(stamp, now).unwrap().provenance
+                clock.judge(stamp, now).unwrap().timestamp_source
             })
             .collect();
         use TimestampSource::{Hardware, Software};
-        assert_eq!(provenances, [Software, Software, Hardware, Hardware]);
+        assert_eq!(timestamp_sources, [Software, Software, Hardware, Hardware]);
         assert_eq!(clock.faults(), FlipFaults::default());
     }
 
@@ -297,7 +302,7 @@ mod tests {
             let seen = unsupported.judge(FlipStamp { sequence: 0, t: now }, now).unwrap();
             assert_eq!(
                 seen,
-                Refresh { t_present: now, provenance: TimestampSource::Software, refresh_count: None, missed: 0 }
+                Refresh { t_present: now, timestamp_source: TimestampSource::Software, refresh_count: None, missed: 0 }
             );
         }
         assert_eq!(unsupported.faults().zero_sequence, 20);
@@ -305,7 +310,10 @@ mod tests {
         let (stamp, now) = event(u32::MAX - 2, 3);
         assert_eq!(stamp.sequence, 0);
         let seen = wrapping.judge(stamp, now).unwrap();
-        assert_eq!((seen.provenance, seen.refresh_count), (TimestampSource::Hardware, Some(u64::from(u32::MAX) + 1)));
+        assert_eq!(
+            (seen.timestamp_source, seen.refresh_count),
+            (TimestampSource::Hardware, Some(u64::from(u32::MAX) + 1))
+        );
     }
 
     #[test]
@@ -315,12 +323,15 @@ mod tests {
         let mut behind = clock();
         for refresh in 0..50 {
             let (stamp, now) = event(9, refresh);
-            assert_eq!(flagged.judge(stamp, now).unwrap().provenance, TimestampSource::Software);
+            assert_eq!(flagged.judge(stamp, now).unwrap().timestamp_source, TimestampSource::Software);
             let wall = FlipStamp { t: TimeNs(stamp.t.0 + 1_700_000_000_000_000_000), ..stamp };
-            assert_eq!(ahead.judge(wall, now).unwrap().provenance, TimestampSource::Software);
+            assert_eq!(ahead.judge(wall, now).unwrap().timestamp_source, TimestampSource::Software);
             let old = FlipStamp { t: TimeNs(stamp.t.0 - 1_000_000_000), ..stamp };
             let seen = behind.judge(old, now).unwrap();
-            assert!(refresh < i64::from(LATE_EVENTS) || seen.provenance == TimestampSource::Software, "{refresh}");
+            assert!(
+                refresh < i64::from(LATE_EVENTS) || seen.timestamp_source == TimestampSource::Software,
+                "{refresh}"
+            );
         }
         assert_eq!(ahead.faults().foreign_clock, 50);
     }
@@ -330,7 +341,7 @@ mod tests {
         let mut clock = locked(7, 10);
         let (stamp, now) = event(7, 11);
         let seen = clock.judge(stamp, TimeNs(now.0 + 3_000_000_000)).unwrap();
-        assert_eq!((seen.provenance, seen.t_present), (TimestampSource::Hardware, truth(11)));
+        assert_eq!((seen.timestamp_source, seen.t_present), (TimestampSource::Hardware, truth(11)));
     }
 
     #[test]
@@ -343,8 +354,8 @@ mod tests {
             })
             .collect();
         use TimestampSource::{Estimated, Hardware};
-        let provenances = seen.iter().map(|refresh| refresh.provenance).collect::<Vec<_>>();
-        assert_eq!(provenances, [Estimated, Estimated, Hardware, Hardware]);
+        let timestamp_sources = seen.iter().map(|refresh| refresh.timestamp_source).collect::<Vec<_>>();
+        assert_eq!(timestamp_sources, [Estimated, Estimated, Hardware, Hardware]);
         assert!(seen.iter().zip(6..).all(|(refresh, n)| refresh.t_present == truth(n)), "{seen:?}");
         assert_eq!(clock.faults().jumped, 3);
     }
@@ -354,11 +365,11 @@ mod tests {
         let mut clock = locked(7, 5);
         let early = FlipStamp { sequence: 7 + 6, t: TimeNs(truth(5).0 + 1_500_000) };
         let seen = clock.judge(early, TimeNs(truth(5).0 + 1_600_000)).unwrap();
-        assert_eq!((seen.provenance, seen.t_present), (TimestampSource::Estimated, truth(6)));
+        assert_eq!((seen.timestamp_source, seen.t_present), (TimestampSource::Estimated, truth(6)));
         assert_eq!(clock.faults().early, 1);
         let (stamp, now) = event(7, 7);
         let seen = clock.judge(stamp, now).unwrap();
-        assert_eq!((seen.provenance, seen.t_present), (TimestampSource::Hardware, truth(7)));
+        assert_eq!((seen.timestamp_source, seen.t_present), (TimestampSource::Hardware, truth(7)));
     }
 
     /// What a driver may do to one event.
@@ -402,7 +413,7 @@ mod tests {
                 let seen = clock.judge(stamp, TimeNs(now.0 + delay)).unwrap();
                 // A counter of zero at the very start is not believed yet.
                 if index >= 3 {
-                    prop_assert_eq!(seen.provenance, TimestampSource::Hardware);
+                    prop_assert_eq!(seen.timestamp_source, TimestampSource::Hardware);
                     prop_assert_eq!(seen.t_present, stamp.t);
                     prop_assert_eq!(seen.missed, step as u64 - 1);
                     prop_assert_eq!(seen.refresh_count.map(|count| count as u32), Some(stamp.sequence));
@@ -443,7 +454,7 @@ mod tests {
                     prop_assert_eq!(seen[1], None);
                 }
                 for refresh in seen.into_iter().flatten() {
-                    if refresh.provenance == TimestampSource::Hardware {
+                    if refresh.timestamp_source == TimestampSource::Hardware {
                         prop_assert_eq!(refresh.t_present, honest.t);
                         prop_assert_eq!(refresh.refresh_count.map(|count| count as u32), Some(honest.sequence));
                         prop_assert!(refresh.t_present > t_last && refresh.refresh_count > Some(count_last));

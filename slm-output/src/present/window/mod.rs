@@ -462,7 +462,7 @@ impl WindowPanel {
             field: picture.refresh * self.fields_per_refresh,
             repeated: picture.repeated,
             t_present: came.t_present,
-            provenance: came.provenance,
+            timestamp_source: came.timestamp_source,
             refresh_count: came.refresh_count,
         });
     }
@@ -544,7 +544,7 @@ impl Presenter for WindowPanel {
         {
             let t_present = host_now();
             self.t_next = (now + self.timing.refresh_period).max(t_present);
-            let came = Presented { t_present, provenance: TimestampSource::Software, refresh_count: None };
+            let came = Presented { t_present, timestamp_source: TimestampSource::Software, refresh_count: None };
             self.report(picture, came, presented);
         }
         Ok(())

@@ -13,7 +13,7 @@ const BEHIND_MAX: TimeNs = TimeNs(1_000_000_000);
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Presented {
     pub(super) t_present: TimeNs,
-    pub(super) provenance: TimestampSource,
+    pub(super) timestamp_source: TimestampSource,
     pub(super) refresh_count: Option<u64>,
 }
 
@@ -65,14 +65,14 @@ impl Timeline {
         if age < TimeNs(-AHEAD_MAX.0) || age > BEHIND_MAX {
             return Outcome::Shown(Presented {
                 t_present: now,
-                provenance: TimestampSource::Software,
+                timestamp_source: TimestampSource::Software,
                 refresh_count: None,
             });
         }
         let is_stamped = completion.shown == Shown::Flipped && counts_on;
         Outcome::Shown(Presented {
             t_present: completion.t_present,
-            provenance: if is_stamped { TimestampSource::Driver } else { TimestampSource::Software },
+            timestamp_source: if is_stamped { TimestampSource::Driver } else { TimestampSource::Software },
             refresh_count: counts_on.then_some(completion.refresh_count),
         })
     }
@@ -202,11 +202,11 @@ mod tests {
 
     #[test]
     fn a_flip_has_the_drivers_time_and_a_copy_has_not() {
-        for (shown, provenance) in
+        for (shown, timestamp_source) in
             [(Shown::Flipped, TimestampSource::Driver), (Shown::Copied, TimestampSource::Software)]
         {
             let outcome = timeline().complete(completion(10, 1016, 101, shown), TimeNs(1017 * MS));
-            let presented = Presented { t_present: TimeNs(1016 * MS), provenance, refresh_count: Some(101) };
+            let presented = Presented { t_present: TimeNs(1016 * MS), timestamp_source, refresh_count: Some(101) };
             assert_eq!(outcome, Outcome::Shown(presented));
         }
     }
@@ -227,14 +227,19 @@ mod tests {
     fn a_time_of_another_clock_or_a_count_that_stands_is_not_the_drivers() {
         for t_ms in [0, 10, 1020, 1_700_000_000_000] {
             let outcome = timeline().complete(completion(10, t_ms, 101, Shown::Flipped), TimeNs(1017 * MS));
-            let arrival =
-                Presented { t_present: TimeNs(1017 * MS), provenance: TimestampSource::Software, refresh_count: None };
+            let arrival = Presented {
+                t_present: TimeNs(1017 * MS),
+                timestamp_source: TimestampSource::Software,
+                refresh_count: None,
+            };
             assert_eq!(outcome, Outcome::Shown(arrival), "{t_ms}");
         }
         for count in [100, 0] {
             let outcome = timeline().complete(completion(10, 1016, count, Shown::Flipped), TimeNs(1017 * MS));
-            let Outcome::Shown(Presented { provenance, refresh_count, .. }) = outcome else { panic!("{outcome:?}") };
-            assert_eq!((provenance, refresh_count), (TimestampSource::Software, None));
+            let Outcome::Shown(Presented { timestamp_source, refresh_count, .. }) = outcome else {
+                panic!("{outcome:?}")
+            };
+            assert_eq!((timestamp_source, refresh_count), (TimestampSource::Software, None));
         }
     }
 }
