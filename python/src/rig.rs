@@ -1,4 +1,4 @@
-//! The bench.
+//! A rig as Python has it: its figures, and levels of its panel from files.
 
 use std::path::{Path, PathBuf};
 

@@ -417,13 +417,13 @@ impl Lasers {
             let limit_mw = self.power_limit_mw[colour].unwrap_or(0.0);
             self.driver.has(colour) && power_mw > 0.0 && power_mw < LOW_POWER_MW && limit_mw < LOW_LIMIT_MW
         });
-        let told = doubtful.map(|(colour, power_mw)| {
+        let notes = doubtful.map(|(colour, power_mw)| {
             format!(
                 "{colour}: the laser's power is {power_mw} mW; where power_mw is in watts, write {}",
                 (power_mw * 1e9).round() / 1e6
             )
         });
-        told.collect()
+        notes.collect()
     }
 }
 
@@ -472,7 +472,7 @@ impl Panel {
         let long = strokes.filter(|&(colour, stroke_rad)| self.lut[colour].is_none() && stroke_rad > LONG_STROKE_RAD);
         // All of them would be radians, and hardly any panel has less than half a wave.
         let may_be_radians = self.stroke_rad.0.iter().all(|stroke_rad| stroke_rad / PI >= PI);
-        let told = long.map(|(colour, stroke_rad)| {
+        let notes = long.map(|(colour, stroke_rad)| {
             let stroke_pi = stroke_rad / PI;
             let last_level = (f64::from(levels - 1) * TAU / stroke_rad) as u32;
             let mut said = format!(
@@ -484,12 +484,12 @@ impl Panel {
             }
             said
         });
-        told.collect()
+        notes.collect()
     }
 
     /// For each of `colours` whose levels leave a gap on the circle, what becomes of the phases that cannot be shown.
     fn short_strokes(&self, colours: &[Colour]) -> Vec<String> {
-        let told = colours.iter().filter_map(|&colour| {
+        let notes = colours.iter().filter_map(|&colour| {
             let [gap_rad, step_rad] = self.gap_and_step(colour);
             // The top level of a 2π panel stands one step short of 2π.
             if gap_rad <= 1.5 * step_rad {
@@ -504,7 +504,7 @@ impl Panel {
                 if is_in_pi { "; where the phases in its table are multiples of π, multiply them by π" } else { "" }
             ))
         });
-        told.collect()
+        notes.collect()
     }
 }
 

@@ -238,8 +238,8 @@ struct RawWriter {
     bytes: Vec<u8>,
     /// The last record that was written.
     last: RecordHead,
-    /// Lost pieces of which the file tells.
-    told: u64,
+    /// Lost pieces that the file counts.
+    lost_in_file: u64,
     out: Output,
 }
 
@@ -305,7 +305,7 @@ impl RawWriter {
         let payload = Vec::with_capacity(MAX_PAYLOAD_BYTES);
         let bytes = Vec::with_capacity(RECORD_HEAD_BYTES + MAX_PAYLOAD_BYTES + 4);
         let last = RecordHead { kind: Kind::Connected, t: t_started, connection: 0 };
-        Self { ring, head: None, payload, bytes, last, told: 0, out }
+        Self { ring, head: None, payload, bytes, last, lost_in_file: 0, out }
     }
 
     /// Writes every whole record that is in the ring; at the end of a run also that it ended, and of how many pieces
@@ -320,13 +320,13 @@ impl RawWriter {
             self.write_record(&head)?;
             self.last = head;
             if head.kind == Kind::Lost {
-                self.told += self.payload.first_chunk().map_or(0, |count| u64::from_le_bytes(*count));
+                self.lost_in_file += self.payload.first_chunk().map_or(0, |count| u64::from_le_bytes(*count));
             }
         }
         let Some(lost) = end_with_lost else { return Ok(()) };
-        if lost > self.told {
+        if lost > self.lost_in_file {
             self.payload.clear();
-            self.payload.extend((lost - self.told).to_le_bytes());
+            self.payload.extend((lost - self.lost_in_file).to_le_bytes());
             self.write_record(&RecordHead { kind: Kind::Lost, ..self.last })?;
         }
         self.payload.clear();

@@ -28,7 +28,7 @@ impl TrackerSpec {
 }
 
 fn faults_of(text: &str, error: TrackerError) -> Vec<Fault> {
-    let told = match error {
+    let spec_fault = match error {
         TrackerError::Profile(ProfileError::Wrong { origin, faults }) => {
             let of_profile = |of: Fault| {
                 let line = of.line.map_or(String::new(), |line| format!(" line {line}"));
@@ -52,7 +52,7 @@ fn faults_of(text: &str, error: TrackerError) -> Vec<Fault> {
         ),
         other => fault(format!("{text:?}"), "a tracker that a profile describes", other.to_string()),
     };
-    vec![told]
+    vec![spec_fault]
 }
 
 fn fault(found: String, expected: &str, advice: String) -> Fault {

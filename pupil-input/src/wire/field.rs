@@ -385,7 +385,7 @@ impl<P> Fields<P> {
         on_event: &mut dyn FnMut(WireEvent),
     ) -> Result<(), WireFault> {
         let Self { layout, time, sequence } = self;
-        let told_eye = match &layout.eye {
+        let eye_in_message = match &layout.eye {
             None => None,
             Some((at, eyes)) => {
                 let raw = message.raw(at);
@@ -405,7 +405,7 @@ impl<P> Fields<P> {
             }
         };
         for pupil in &layout.pupils {
-            let eye = pupil.eye.or(told_eye).unwrap_or(SampleEye::Both);
+            let eye = pupil.eye.or(eye_in_message).unwrap_or(SampleEye::Both);
             let PupilFigures { diameter_mm, confidence, aperture_mm, valid } =
                 match read_pupil(message, pupil, layout.size) {
                     Ok(figures) => figures,

@@ -352,13 +352,13 @@ impl Stream {
         // NTP's seconds begin anew in 2036.
         let era = if i64::from(seconds) < UNIX_IN_NTP_S { 1_i64 << 32 } else { 0 };
         let unix_s = i64::from(seconds) + era - UNIX_IN_NTP_S;
-        let told_ns = i128::from(unix_s) * 1_000_000_000 + ((i128::from(fraction) * 1_000_000_000) >> 32);
+        let reported_ns = i128::from(unix_s) * 1_000_000_000 + ((i128::from(fraction) * 1_000_000_000) >> 32);
         let ticks = self.ticks(rtp_time);
         let unix_ns = match self.anchor.map(|anchor| anchor.unix_ns_at(ticks, rate)) {
-            Some(expected_ns) if (told_ns - expected_ns).abs() < CLOCK_STEP => {
-                expected_ns + (told_ns - expected_ns) / 8
+            Some(expected_ns) if (reported_ns - expected_ns).abs() < CLOCK_STEP => {
+                expected_ns + (reported_ns - expected_ns) / 8
             }
-            _ => told_ns,
+            _ => reported_ns,
         };
         self.anchor = Some(Anchor { ticks, unix_ns });
     }

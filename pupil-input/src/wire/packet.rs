@@ -154,10 +154,10 @@ impl PacketDecoder {
         let length = match &self.length {
             PacketLength::Fixed(length) => *length,
             PacketLength::Told { field, adds, least, most } => {
-                let Ok(told) = Bytes(bytes).raw(field) else {
+                let Ok(figure) = Bytes(bytes).raw(field) else {
                     return if bytes.len() < *least { Head::Open } else { Head::None(WireFault::TooShort) };
                 };
-                let length = adds.saturating_add(told.number() as i64);
+                let length = adds.saturating_add(figure.number() as i64);
                 match usize::try_from(length) {
                     Ok(length) if length > *most => return Head::None(WireFault::TooLong),
                     Ok(length) if length >= *least => length,

@@ -91,12 +91,12 @@ pub(super) fn read_layout<'a, P: Places<'a>>(
         if !table.is_there() {
             continue;
         }
-        let told = wire.has("eye");
-        if own_eye.is_none() && !told && context.eye.is_none() {
+        let eye_on_wire = wire.has("eye");
+        if own_eye.is_none() && !eye_on_wire && context.eye.is_none() {
             const EXPECTED: &str = "an eye: `eye = \"left\"` at the top of the file, or [wire.eye]";
             table.fault("no word on its eye", EXPECTED, "or name the table after its eye, as [wire.left]");
         }
-        let eye = own_eye.or(context.eye.as_ref().filter(|_| !told).map(|eye| eye.value));
+        let eye = own_eye.or(context.eye.as_ref().filter(|_| !eye_on_wire).map(|eye| eye.value));
         let pupil = read_pupil(places, &table, eye);
         table.finish();
         if let Some(pupil) = pupil {
