@@ -794,7 +794,21 @@ fn what_a_panel_does_in_channel_packed_mode_alone_is_refused_in_the_others() {
     let late =
         changed(&[SEQUENTIAL, ("refresh_hz = 60.0", "refresh_hz = 180.0"), ("settle_ms = 2.0", "settle_ms = 7.5")]);
     let [fault] = faults_of(&late).try_into().unwrap();
-    assert!(fault.advice.contains("shows its video a frame later"), "{}", fault.advice);
+    assert!(fault.advice.contains("panel.latency_ms"), "{}", fault.advice);
+}
+
+#[test]
+fn a_panel_may_show_its_video_later() {
+    assert_eq!(Rig::parse(&changed(&[]), Path::new("")).unwrap().panel.latency, TimeNs(0));
+    let later = changed(&[("settle_ms = 2.0", "settle_ms = 2.0\nlatency_ms = 25")]);
+    let rig = Rig::parse(&later, Path::new("")).unwrap();
+    assert_eq!(rig.panel.latency, TimeNs(25_000_000));
+    let meaning = rig.meaning();
+    assert_eq!(meaning.field.latency_ms, 25.0);
+    assert!(meaning.to_string().contains("\nlatency        25.000 ms, 1.50 refreshes: "), "{meaning}");
+    let long = fault_of("settle_ms = 2.0", "settle_ms = 2.0\nlatency_ms = 16667");
+    let line = line_of("settle_ms").map(|line| line + 1);
+    assert_fault(&long, "panel.latency_ms", line, "16667", "0 to 100 ms", "looks like microseconds: write 16.667 ");
 }
 
 #[test]
@@ -1584,6 +1598,8 @@ fn times_in_seconds_are_asked_for_their_unit() {
     let [alone] = told(&[settle]).try_into().unwrap();
     assert!(alone.starts_with("settle_ms = 0.002: short") && alone.ends_with("write settle_ms = 2"), "{alone}");
     assert_eq!(told(&[delay]), [""; 0]);
+    let [latency] = told(&[("settle_ms = 2.0", "settle_ms = 2.0\nlatency_ms = 0.0167")]).try_into().unwrap();
+    assert!(latency.starts_with("latency_ms = 0.0167: ") && latency.ends_with("write latency_ms = 16.7"), "{latency}");
     assert_eq!(told(&[("settle_ms = 2.0", "settle_ms = 0")]), [""; 0]);
     // In seconds it would be longer than the field.
     assert_eq!(told(&[("settle_ms = 2.0", "settle_ms = 0.02")]), [""; 0]);

@@ -29,7 +29,7 @@ pub struct FrameRecord {
     pub t_render_end: TimeNs,
     /// The levels were handed to the presenter.
     pub t_submit: TimeNs,
-    /// The refresh that the pacing aimed at.
+    /// When it was to come on the panel.
     pub t_desired_present: TimeNs,
     /// The picture that was shown.
     pub picture: PictureTag,

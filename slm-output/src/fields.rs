@@ -143,7 +143,7 @@ pub struct FrameTag {
     pub frame_id: u64,
     /// When the frame was handed to the panel.
     pub t_submit: holod_calibration::TimeNs,
-    /// The refresh that it was made for.
+    /// When it was to come on the panel.
     pub t_desired_present: holod_calibration::TimeNs,
     /// The memory slot in which the panel shall keep the levels that it has really shown, if any.
     pub keep: Option<usize>,

@@ -46,6 +46,8 @@ pub struct PacingConfig {
     pub refresh_period: TimeNs,
     /// From a colour frame's presentation to the middle of its light.
     pub photon_delay: TimeNs,
+    /// From a refresh that the display reports to its presentation on the panel.
+    pub latency: TimeNs,
     /// A frame must be submitted this long before the refresh that it is for. Panels that choose their frame earlier
     /// are learned from frames that were in time and came a refresh late: by so much more after each.
     pub submit_margin: TimeNs,
@@ -60,7 +62,7 @@ pub struct FramePlan {
     pub frame_id: u64,
     /// Host time at which its making is to begin.
     pub t_wake: TimeNs,
-    /// The refresh that it is for.
+    /// When it is to come on the panel.
     pub t_desired_present: TimeNs,
     /// When its light reaches the eye.
     pub t_predicted_photon: TimeNs,
@@ -148,6 +150,7 @@ impl Pacer {
         let lead = self.lead;
         self.slots[slot_index(frame_id)] =
             Some(Slot { frame_id, t_wake, t_desired_present, lead, t_submit: None, reported: false });
+        let t_desired_present = t_desired_present + self.config.latency;
         let t_predicted_photon = t_desired_present + self.config.photon_delay;
         FramePlan { frame_id, t_wake, t_desired_present, t_predicted_photon }
     }
@@ -383,8 +386,27 @@ mod tests {
         PacingConfig {
             refresh_period: REFRESH,
             photon_delay: TimeNs(9 * MS),
+            latency: TimeNs(0),
             submit_margin: TimeNs(MS),
             first_frame_time: TimeNs(10 * MS),
+        }
+    }
+
+    #[test]
+    fn a_panel_that_is_late_moves_what_is_shown_and_not_what_is_done() {
+        let latency = TimeNs(25 * MS);
+        let mut pacers = [config(), PacingConfig { latency, ..config() }].map(|config| Pacer::new(config, TimeNs(0)));
+        for frame in 0..50 {
+            let now = TimeNs(frame * 20 * MS);
+            let [plan, late] = pacers.each_mut().map(|pacer| pacer.predict(now));
+            assert_eq!(late.t_wake, plan.t_wake);
+            assert_eq!(late.t_desired_present, plan.t_desired_present + latency);
+            assert_eq!(late.t_predicted_photon, plan.t_predicted_photon + latency);
+            for pacer in &mut pacers {
+                pacer.submitted(plan.frame_id, plan.t_wake + TimeNs(5 * MS));
+                // The display reports its own refresh.
+                pacer.report(plan.frame_id, plan.t_desired_present, TimestampSource::Hardware);
+            }
         }
     }
 

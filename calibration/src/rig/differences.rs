@@ -26,6 +26,7 @@ impl Rig {
             lut,
             flatness_rad,
             settle,
+            latency,
         } = panel;
         let DisplayGeometry { resolution, pixel_pitch, wavelengths, eyepiece_focal_length, depth_far, depth_near } =
             geometry;
@@ -71,6 +72,7 @@ impl Rig {
             ("panel.stroke_pi", *stroke_rad == other.panel.stroke_rad),
             ("panel.out_of_stroke", *out_of_stroke == other.panel.out_of_stroke),
             ("panel.settle_ms", *settle == other.panel.settle),
+            ("panel.latency_ms", *latency == other.panel.latency),
             ("panel.lut_file", *lut == other.panel.lut),
             ("panel.flatness_file", *flatness_rad == other.panel.flatness_rad),
             ("optics.wavelengths_nm", *wavelengths == other.geometry.wavelengths),
@@ -122,6 +124,7 @@ mod tests {
             ("eye = \"both\"", "eye = \"left\"", &["tracker.eye"]),
             ("network = \"standard\"", "network = \"small\"", &["model.network"]),
             ("[model]", "[model]\npupil_step_mm = 0", &["model.pupil_step_mm"]),
+            ("settle_ms", "latency_ms = 3\nsettle_ms", &["panel.latency_ms"]),
             ("depth_near_m = 0.35", "depth_near_m = 0.25", &["optics.depth_near"]),
         ] {
             let text = Rig::BUILT_IN_TOML.replacen(found, instead, 1);

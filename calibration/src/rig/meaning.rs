@@ -126,6 +126,8 @@ pub struct FieldMeaning {
     pub period_ms: f64,
     /// When the phase has settled.
     pub settled_ms: f64,
+    /// From the display's refresh to the panel's update with its video.
+    pub latency_ms: f64,
     /// Who lights the laser for this field alone: `laser-box` or `panel`; absent where it is on while it is armed.
     pub gated_by: Option<&'static str>,
     /// When the laser goes on; absent where no box switches it for this field.
@@ -313,6 +315,7 @@ impl FieldMeaning {
             channels: (panel.mode == PanelMode::ChannelPacked).then(|| panel.channel_order.map(Colour::name)),
             period_ms,
             settled_ms,
+            latency_ms: milliseconds(panel.latency),
             gated_by,
             lit_share: share(lit_share),
             time_share: share(lit_share * fields_of_colour as f64 / panel.fields() as f64),
@@ -384,12 +387,18 @@ impl Rig {
         self.panel.warnings(&lit)
     }
 
-    /// Times of a field that are so short that they would also fit into it if they were in seconds.
+    /// Times of a field that are so short that they would also fit into it if they were in seconds, and a latency that
+    /// would be within its bounds.
     fn times_in_seconds(&self) -> Option<String> {
         let field_ns = self.panel.field_period().0;
-        let times =
-            [("settle_ms", self.panel.settle), ("on_delay_ms", self.lasers.on_delay), ("lit_ms", self.lasers.width)];
-        let short: Vec<_> = times.into_iter().filter(|(_, TimeNs(ns))| (1..field_ns / 1000).contains(ns)).collect();
+        let times = [
+            ("settle_ms", self.panel.settle, field_ns / 1000),
+            ("latency_ms", self.panel.latency, 100_000),
+            ("on_delay_ms", self.lasers.on_delay, field_ns / 1000),
+            ("lit_ms", self.lasers.width, field_ns / 1000),
+        ];
+        let short = times.into_iter().filter(|(_, TimeNs(ns), least_ns)| (1..*least_ns).contains(ns));
+        let short: Vec<_> = short.map(|(key, time, _)| (key, time)).collect();
         // A delay as short as that is nothing odd by itself.
         if short.iter().all(|(key, _)| *key == "on_delay_ms") {
             return None;
@@ -736,6 +745,14 @@ impl fmt::Display for Meaning {
             field.period_ms,
             field.colour_frames_hz
         )?;
+        if field.latency_ms > 0.0 {
+            let refreshes = field.latency_ms * field.refresh_hz / 1e3;
+            writeln!(
+                f,
+                "latency        {:.3} ms, {refreshes:.2} refreshes: so much later the panel shows what the display was given",
+                field.latency_ms
+            )?;
+        }
         write!(f, "in one field   settled at {:.3} ms", field.settled_ms)?;
         match (field.laser_on_ms, field.laser_off_ms, field.lit_share, field.time_share) {
             (Some(on_ms), Some(off_ms), Some(lit_share), Some(time_share)) => writeln!(

@@ -127,6 +127,8 @@ pub struct Panel {
     pub flatness_rad: PerColour<Option<Vec<f32>>>,
     /// Time from the panel's update to a settled phase.
     pub settle: TimeNs,
+    /// Time from the display's refresh, as the display reports it, to the panel's update with that refresh's video.
+    pub latency: TimeNs,
 }
 
 /// Columns and rows of a video frame around the panel's own pixels, for panels that take a larger frame than they show.
@@ -418,6 +420,7 @@ impl Default for Rig {
                 lut: PerColour([None, None, None]),
                 flatness_rad: PerColour([None, None, None]),
                 settle: TimeNs(2_000_000),
+                latency: TimeNs(0),
             },
             geometry: DisplayGeometry::DEFAULT,
             relay_magnification: 1.0,

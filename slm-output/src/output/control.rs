@@ -55,6 +55,8 @@ pub struct OutputControl {
     pub(super) switch: DarkSwitch,
     pub(super) doorbell: Arc<OwnedFd>,
     pub(super) frame_period: TimeNs,
+    /// From the display's report of a refresh to the panel's update with it.
+    pub(super) latency: TimeNs,
     /// How long the laser box may wait for an acknowledgement.
     pub(super) dark_wait: TimeNs,
     pub(super) threads: Option<Threads>,
@@ -139,6 +141,9 @@ impl OutputControl {
         // A panel that is lost shows nothing any more.
         let flat = || shared.flat_shown.load(Ordering::Acquire);
         let flat_presented = wait_for(&|| flat() || shared.panel_lost.load(Ordering::Acquire), flat_patience) && flat();
+        if flat_presented {
+            std::thread::sleep(Duration::from_nanos(self.latency.0 as u64));
+        }
         shared.stop.store(true, Ordering::Release);
         ring(&self.doorbell);
         let (kept, counts) = (Vec::new(), OutputCounts::default());

@@ -12,6 +12,7 @@ use super::panel_thread::PanelNews;
 use super::shared::{DARK, FAILED, NOT_YET, Shared, count, dark_request_parts};
 use super::{Clock, SLEEP_MAX};
 use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram};
+use crate::present::PresentedRefresh;
 use crate::schedule::{FieldDecision, FieldScheduler, Orders};
 
 /// How long a laser box that failed is left alone.
@@ -36,6 +37,8 @@ pub(super) struct LaserThread {
     /// The box failed and may have lost its program.
     pub(super) program_lost: bool,
     pub(super) shared: Arc<Shared>,
+    /// From the display's report of a refresh to the panel's update with it.
+    pub(super) latency: TimeNs,
     pub(super) clock: Clock,
 }
 
@@ -49,7 +52,8 @@ impl LaserThread {
                 self.ledger.flush(TimeNs(i64::MAX), &self.shared);
                 return;
             }
-            let t_next = self.scheduler.t_next().map_or(SLEEP_MAX, |t| (t - now).max(TimeNs(0)));
+            let t_next = self.scheduler.t_next().into_iter().chain(self.t_news(now)).min();
+            let t_next = t_next.map_or(SLEEP_MAX, |t| (t - now).max(TimeNs(0)));
             let rest = t_next.min(self.scheduler.gate().timing().field_period).min(SLEEP_MAX);
             std::thread::park_timeout(Duration::from_nanos(rest.0 as u64));
         }
@@ -63,8 +67,14 @@ impl LaserThread {
         // What comes meanwhile waits for the next turn: where a box answers more slowly than refreshes come, this one
         // would never end.
         for _ in 0..self.news.slots() {
+            let now = clock();
+            if self.t_news(now).is_none_or(|t| t > now) {
+                break;
+            }
             let Ok(news) = self.news.pop() else { break };
             match news {
+                // The panel was lost before it could show it.
+                PanelNews::Refresh(refresh) if self.is_to_come(&refresh, now) => {}
                 PanelNews::Refresh(refresh) => {
                     // What the panel showed before is over by then, however late this thread is.
                     self.decide_fields(refresh.t_present.min(clock()), &clock);
@@ -79,7 +89,7 @@ impl LaserThread {
         }
         let now = clock();
         // Reports that wait are not missing.
-        if self.news.is_empty() {
+        if self.t_news(now).is_none_or(|t| t > now) {
             let orders = self.scheduler.watch(now);
             self.obey(orders, now);
         }
@@ -88,6 +98,21 @@ impl LaserThread {
         self.shared.refresh_millihz.store((self.scheduler.refresh_hz() * 1e3).round() as u64, Ordering::Relaxed);
         self.ledger.flush(self.laser.known_until(now), &self.shared);
         now
+    }
+
+    /// When the oldest of the panel's news is to be dealt with: at once, but for a refresh that is not on the panel yet.
+    pub(super) fn t_news(&self, now: TimeNs) -> Option<TimeNs> {
+        let is_lost = self.shared.panel_lost.load(Ordering::Acquire);
+        match self.news.peek().ok()? {
+            PanelNews::Refresh(refresh) if !is_lost && self.is_to_come(refresh, now) => Some(refresh.t_present),
+            PanelNews::Refresh(_) | PanelNews::Lost => Some(now),
+        }
+    }
+
+    /// Whether a refresh that the display took is still on its way to the panel. One that is farther off than the
+    /// latency was reported before its time, and is judged at once, as it would be without one.
+    fn is_to_come(&self, refresh: &PresentedRefresh, now: TimeNs) -> bool {
+        now < refresh.t_present && refresh.t_present.0 <= now.0.saturating_add(self.latency.0)
     }
 
     /// Obeys those who want darkness, for good or until they take it back, and keeps dark while nobody could want it.

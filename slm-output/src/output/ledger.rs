@@ -25,7 +25,7 @@ pub struct FieldEvent {
     pub colour: Colour,
     /// When the frame was submitted.
     pub t_submit: TimeNs,
-    /// The refresh that the frame was made for.
+    /// When the frame was to come on the panel.
     pub t_desired_present: TimeNs,
     /// When the field came on the panel.
     pub t_present: TimeNs,

@@ -48,8 +48,11 @@ use crate::schedule::{Evidence, FieldGate, FieldScheduler, WindowClock};
 /// A monotonic clock. The threads read it; nothing below them does.
 pub type Clock = fn() -> TimeNs;
 
-/// Refreshes on their way to the laser thread, and reports on their way to the frame thread.
+/// Reports on their way to the frame thread.
 const SHORT_RING: usize = 256;
+/// Refreshes on their way to the laser thread, where they wait for a panel's latency: 200 of them at the most that a rig
+/// may say, 100 ms and 2000 Hz.
+const NEWS_RING: usize = 1024;
 /// Events on their way to whoever records them: some 20 s of fields at 180 Hz.
 const LONG_RING: usize = 4096;
 /// Longest sleep of a thread, so that it sees an order to stop.
@@ -131,7 +134,7 @@ impl Output {
         laser.program(&program, clock())?;
 
         let (sink, source) = frame_channel(&flat);
-        let (news_producer, news_consumer) = RingBuffer::new(SHORT_RING);
+        let (news_producer, news_consumer) = RingBuffer::new(NEWS_RING);
         let (report_producer, report_consumer) = RingBuffer::new(SHORT_RING);
         let (event_producer, event_consumer) = RingBuffer::new(LONG_RING);
         let (box_producer, box_consumer) = RingBuffer::new(LONG_RING);
@@ -158,6 +161,7 @@ impl Output {
             asked: None,
             is_unattended: false,
             shared: Arc::clone(&shared),
+            latency: gate.timing().latency,
             clock,
         };
         let laser = std::thread::Builder::new().name("holod-laser".into()).spawn(move || laser_thread.run())?;
@@ -171,6 +175,7 @@ impl Output {
             laser: laser.thread().clone(),
             doorbell: Arc::clone(&doorbell),
             shared: Arc::clone(&shared),
+            latency: gate.timing().latency,
             clock,
         };
         let threads = Threads::start_panel(laser, panel_thread)?;
@@ -187,6 +192,7 @@ impl Output {
                 switch: DarkSwitch { shared, laser: threads.laser.thread().clone() },
                 doorbell,
                 frame_period: gate.timing().frame_period,
+                latency: gate.timing().latency,
                 dark_wait,
                 threads: Some(threads),
                 clock,
@@ -251,6 +257,7 @@ pub fn pacing_config(rig: &Rig, first_frame_time: TimeNs) -> Result<PacingConfig
     Ok(PacingConfig {
         refresh_period: timing.frame_period,
         photon_delay: TimeNs(middle_field_ns) + gate.middle(),
+        latency: timing.latency,
         submit_margin: timing.submit_margin(),
         first_frame_time,
     })

@@ -21,7 +21,7 @@ const RECOVER_EVERY: TimeNs = TimeNs(250_000_000);
 /// From the panel's thread to the lasers'.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PanelNews {
-    /// A refresh came on the panel.
+    /// A refresh came on the panel, or will after the panel's latency.
     Refresh(PresentedRefresh),
     /// The panel is lost.
     Lost,
@@ -47,6 +47,8 @@ pub(super) struct PanelThread {
     /// Rung when there is an order for this thread.
     pub(super) doorbell: Arc<OwnedFd>,
     pub(super) shared: Arc<Shared>,
+    /// From a refresh that the display reports to the panel's update with it.
+    pub(super) latency: TimeNs,
     pub(super) clock: Clock,
 }
 
@@ -70,10 +72,10 @@ impl PanelThread {
     }
 
     fn tick(&mut self) -> Result<(), PanelFault> {
-        let Self { panel, frames, news, reports, laser, shared, clock, .. } = self;
+        let Self { panel, frames, news, reports, laser, shared, latency, clock, .. } = self;
         let flat_wanted = shared.flat_wanted.load(Ordering::Acquire);
         panel.tick(clock(), frames, &mut |refresh| {
-            if news.push(PanelNews::Refresh(refresh)).is_err() {
+            if news.push(PanelNews::Refresh(refresh.shown_after(*latency))).is_err() {
                 count(&shared.lost);
             }
             let report = refresh.frame.filter(|_| refresh.field == 0).map(|frame| PresentReport {

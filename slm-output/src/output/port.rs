@@ -12,7 +12,7 @@ use crate::present::{FrameSink, TimestampSource};
 pub struct PresentReport {
     /// Number of the frame that is shown.
     pub frame_id: u64,
-    /// Host time at which its first field came on the panel.
+    /// Host time of the display's refresh with its first field; it is on the panel a latency later.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
     pub timestamp_source: TimestampSource,

@@ -83,7 +83,7 @@ impl Bench {
         laser.program(&program, TimeNs(0)).unwrap();
         let gates_fields = laser.capability().gates_fields;
         let (sink, source) = frame_channel(&setup.flat);
-        let (news, news_consumer) = RingBuffer::new(SHORT_RING);
+        let (news, news_consumer) = RingBuffer::new(NEWS_RING);
         let (event_producer, events) = RingBuffer::new(LONG_RING);
         let (box_producer, box_events) = RingBuffer::new(LONG_RING);
         let laser = LaserThread {
@@ -99,6 +99,7 @@ impl Bench {
             asked: None,
             is_unattended: false,
             shared: Arc::default(),
+            latency: gate.timing().latency,
             clock: || TimeNs(0),
         };
         let t_open = T_FIRST - gate.timing().frame_period;
@@ -269,6 +270,32 @@ fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
         assert!(bench.edges.len() > edges + 10, "lit again by the rules");
         assert_eq!(bench.verdict().unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
     }
+}
+
+#[test]
+fn a_refresh_that_is_reported_before_its_time_is_not_believed_whatever_the_latency() {
+    const LATENCY: TimeNs = TimeNs(3 * MS);
+    for mode in MODES {
+        let lit = |falsify: fn(PresentedRefresh) -> Option<PresentedRefresh>| {
+            let mut late = rig(mode);
+            late.panel.latency = LATENCY;
+            let mut bench = Bench::with_rig(&late, Box::new(SimulatedLaser::new(TimeNs(0))));
+            bench.falsify = falsify;
+            bench.run(TimeNs(500 * MS), TimeNs(0));
+            bench.edges.len()
+        };
+        assert!(lit(|refresh| Some(refresh.shown_after(LATENCY))) > 20, "{mode:?}");
+        assert_eq!(lit(|refresh| Some(refresh.shown_after(LATENCY + TimeNs(500_000)))), 0, "{mode:?}");
+    }
+    let none = PresentedRefresh {
+        frame: None,
+        field: 0,
+        repeated: false,
+        t_present: TimeNs(0),
+        timestamp_source: TimestampSource::Hardware,
+        refresh_count: None,
+    };
+    assert_eq!(none.shown_after(LATENCY), none, "no time stays none");
 }
 
 /// The reasons of the dark fields that came on the panel from `from` to `to`, by their number.

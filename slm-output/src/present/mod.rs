@@ -36,7 +36,7 @@ pub enum TimestampSource {
     Hardware,
     /// The display server or driver reported it, from the controller's stamp as far as it says so.
     Driver,
-    /// A sync input that sees the panel itself.
+    /// A sync input on the display's way to the panel.
     External,
     /// Software took the time, near the event but not from it. Of a virtual panel it is exact.
     Software,
@@ -68,6 +68,8 @@ pub struct PanelTiming {
     pub frame_period: TimeNs,
     /// Fields in a colour frame.
     pub fields: usize,
+    /// From a refresh that the display reports to the panel's update with its video.
+    pub latency: TimeNs,
 }
 
 impl PanelTiming {
@@ -76,7 +78,7 @@ impl PanelTiming {
         let (field_period, fields) = (panel.field_period(), panel.fields());
         let frame_period = TimeNs(field_period.0 * fields as i64);
         let refresh_period = if panel.mode == PanelMode::ChannelPacked { frame_period } else { field_period };
-        Self { field_period, refresh_period, frame_period, fields }
+        Self { field_period, refresh_period, frame_period, fields, latency: panel.latency }
     }
 
     /// How long before a refresh the frame that is for it must be submitted, as far as nothing else is known.
@@ -94,12 +96,23 @@ pub struct PresentedRefresh {
     pub field: usize,
     /// Whether the colour frame had been shown before, because no newer one was there in time.
     pub repeated: bool,
-    /// When the pattern came on the panel.
+    /// When the pattern came on the panel; a [`Presenter`] tells when the display took it, which is sooner by the
+    /// panel's latency.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
     pub timestamp_source: TimestampSource,
     /// The display controller's own count of refreshes, where it has one.
     pub refresh_count: Option<u64>,
+}
+
+impl PresentedRefresh {
+    /// The same as a panel of that latency shows it. A time that is none stays so.
+    pub(crate) fn shown_after(self, latency: TimeNs) -> Self {
+        match self.t_present {
+            TimeNs(..=0) => self,
+            TimeNs(t) => Self { t_present: TimeNs(t.saturating_add(latency.0)), ..self },
+        }
+    }
 }
 
 /// What goes wrong at a panel that was open. Lasers are dark until the panel is back.

@@ -8,6 +8,7 @@ use crate::rig::reader::{Found, Reader, Section, Span};
 const REFRESH: Span = Span::new(10.0, 2000.0, "Hz").slips(&[("millihertz", 1e-3)]);
 const FRAMES_PER_COLOUR: Span = Span::new(1.0, 8.0, "video frames");
 const SETTLE: Span = Span::new(0.0, 100.0, "ms").slips(&[("microseconds", 1e-3)]);
+const LATENCY: Span = Span::new(0.0, 100.0, "ms").slips(&[("microseconds", 1e-3)]);
 
 /// The panel as a clock.
 #[derive(Clone, Copy)]
@@ -18,6 +19,7 @@ pub(super) struct FieldTiming {
     pub(super) channel_order: [Colour; 3],
     pub(super) frames_per_colour: u8,
     pub(super) settle_ms: Found<f64>,
+    pub(super) latency_ms: f64,
     pub(super) field_ms: f64,
 }
 
@@ -52,17 +54,26 @@ pub(super) fn read_field_timing<'a>(reader: &Reader<'a>, panel: Section<'a>) -> 
     let channel_order = read_channel_order(reader, panel, mode);
     let frames_per_colour = read_frames_per_colour(reader, panel, mode);
     let settle_ms = reader.required_number(panel, "settle_ms", SETTLE);
+    let latency_ms = reader.number(panel, "latency_ms", LATENCY).map_or(0.0, |found| found.value);
     let (refresh_hz, mode, settle_ms) = (refresh_hz?.value, mode?, settle_ms?);
     let field_ms = 1e3 / (refresh_hz * mode.fields_per_refresh());
     let (field_order, channel_order, frames_per_colour) = (field_order?, channel_order?, frames_per_colour?);
-    let timing = FieldTiming { refresh_hz, mode, field_order, channel_order, frames_per_colour, settle_ms, field_ms };
+    let timing = FieldTiming {
+        refresh_hz,
+        mode,
+        field_order,
+        channel_order,
+        frames_per_colour,
+        settle_ms,
+        latency_ms,
+        field_ms,
+    };
     if settle_ms.value >= field_ms {
         let expected = format!("less than the {}", timing.describe_field());
-        let mut advice = "no phase would ever settle: correct the settle time or lower refresh_hz".to_owned();
-        if mode == PanelMode::FieldSequential {
-            advice += "; a panel that shows its video a frame later, which settle_ms is not for, cannot be lit field by \
-                       field";
-        }
+        let advice =
+            "no phase would ever settle: correct the settle time or lower refresh_hz; by how much later a panel \
+                      shows its video is panel.latency_ms"
+                .to_owned();
         reader.fault_in(panel, "settle_ms", settle_ms.line, &format!("{} ms", settle_ms.value), &expected, advice);
     }
     Some(timing)

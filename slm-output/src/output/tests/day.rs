@@ -25,8 +25,9 @@ const NIGHT: std::ops::Range<i64> = 600..1080;
 /// How far times may be off that were rounded to the box's microseconds.
 const ROUNDING: TimeNs = TimeNs(1_000);
 
-fn day_rig() -> Rig {
+fn day_rig(latency: TimeNs) -> Rig {
     let mut rig = rig(PanelMode::FieldSequential);
+    rig.panel.latency = latency;
     // Room at both ends for reports that are off by up to 60 µs.
     rig.lasers.on_delay = TimeNs(250_000);
     rig.lasers.width = TimeNs(2_800_000);
@@ -127,6 +128,8 @@ struct TruePanel {
     frame: Option<FrameTag>,
     waiting: Option<FrameTag>,
     lost: bool,
+    /// From its taking a field to its showing it.
+    latency: TimeNs,
 }
 
 /// What is wrong now and until when.
@@ -177,13 +180,14 @@ struct Day {
 }
 
 impl Day {
-    fn new(seed: u64) -> Self {
-        let rig = day_rig();
+    /// Of a panel of that latency, and a rig that says so.
+    fn new(seed: u64, latency: TimeNs) -> Self {
+        let rig = day_rig(latency);
         let fails = Arc::new(AtomicBool::new(false));
         let faulty = Intercepted::new(TimeNs(0), Faulty(Arc::clone(&fails)));
         let Bench { laser, news, events, box_events, .. } = Bench::with_rig(&rig, Box::new(faulty));
         let period = laser.scheduler.gate().timing().refresh_period;
-        let panel = TruePanel { period, t_next: T_FIRST, field: 0, frame: None, waiting: None, lost: false };
+        let panel = TruePanel { period, t_next: T_FIRST, field: 0, frame: None, waiting: None, lost: false, latency };
         let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(8 * MS)).unwrap(), TimeNs(0));
         let plan = pacer.predict(TimeNs(0));
         Self {
@@ -237,7 +241,7 @@ impl Day {
         self.panel.t_next = t_end;
         if std::mem::take(&mut self.trouble.missed) {
             if let Some(last) = self.judge.shown.back_mut() {
-                last.t_end = t_end;
+                last.t_end = t_end + self.panel.latency;
             }
             return;
         }
@@ -252,7 +256,9 @@ impl Day {
         let (silent, doubled, early_ns) = (std::mem::take(silent), std::mem::take(doubled), std::mem::take(early_ns));
         *refreshes_since_lie = if doubled || early_ns > 0 { 0 } else { refreshes_since_lie.saturating_add(1) };
         let colour = self.panel.frame.map(|_| self.layout.colour_of_field(field));
-        let shown = Shown { colour, t_begin: t_true, t_end, t_told: (!silent).then_some(now) };
+        let latency = self.panel.latency;
+        let t_told = (!silent).then_some(now);
+        let shown = Shown { colour, t_begin: t_true + latency, t_end: t_end + latency, t_told };
         self.judge.show(shown);
         if let Some((all, _)) = &mut self.kept {
             all.push(shown);
@@ -271,12 +277,14 @@ impl Day {
             timestamp_source: TimestampSource::Hardware,
             refresh_count: None,
         };
-        self.tell(PanelNews::Refresh(refresh));
+        let latency = self.laser.latency;
+        self.tell(PanelNews::Refresh(refresh.shown_after(latency)));
         if doubled {
-            self.tell(PanelNews::Refresh(PresentedRefresh { t_present: t_present + TimeNs(100_000), ..refresh }));
+            let again = PresentedRefresh { t_present: t_present + TimeNs(100_000), ..refresh };
+            self.tell(PanelNews::Refresh(again.shown_after(latency)));
         }
         if new && let Some(tag) = self.panel.frame {
-            let late_ns = (t_present - tag.t_desired_present).0;
+            let late_ns = (t_present + latency - tag.t_desired_present).0;
             self.frames_missed += u64::from(late_ns > 3 * self.panel.period.0 / 2);
             self.reports.push_back((now, tag.frame_id, t_present));
         }
@@ -285,6 +293,18 @@ impl Day {
     fn tell(&mut self, news: PanelNews) {
         if self.news.push(news).is_err() {
             crate::output::shared::count(&self.laser.shared.lost);
+        }
+    }
+
+    /// The lasers' thread wakes up for each refresh that comes on the panel before `t_end`.
+    fn wake_lasers(&mut self, t_end: TimeNs) {
+        while let Some(t) = self.laser.t_news(self.now).filter(|&t| t > self.now) {
+            let t = t + TimeNs(self.random.random_range(20_000..400_000));
+            if t >= t_end {
+                return;
+            }
+            self.laser.step(|| t);
+            self.now = t;
         }
     }
 
@@ -324,6 +344,7 @@ impl Day {
         let over = |t: &mut Option<TimeNs>| t.take_if(|t| *t <= now).is_some();
         if over(&mut self.trouble.t_panel_back) {
             self.panel.lost = false;
+            self.laser.shared.panel_lost.store(false, Ordering::Release);
             self.panel.frame = None;
             self.panel.field = 0;
             self.panel.t_next = now + TimeNs(self.random.random_range(1..self.panel.period.0));
@@ -384,9 +405,11 @@ impl Day {
         let now = self.now;
         self.trouble.t_panel_back = Some(t_back);
         self.panel.lost = true;
+        self.laser.shared.panel_lost.store(true, Ordering::Release);
         self.tell(PanelNews::Lost);
         // Dark and flat come in the same moment.
         self.laser.step(|| now);
+        while self.judge.shown.pop_back_if(|shown| shown.t_begin > now).is_some() {}
         self.judge.show(Shown { colour: None, t_begin: now, t_end: TimeNs(i64::MAX), t_told: None });
     }
 
@@ -397,8 +420,12 @@ impl Day {
             if bad && self.now < t_end - TimeNs(CALM) && self.random.random_bool(0.03) {
                 self.begin_trouble();
             }
-            let late_ns = self.random.random_range(20_000..400_000) + std::mem::take(&mut self.trouble.wakes_late_ns);
+            let stands_ns = std::mem::take(&mut self.trouble.wakes_late_ns);
             let t = if self.panel.lost { self.now + SLEEP_MAX } else { self.panel.t_next };
+            if stands_ns == 0 {
+                self.wake_lasers(t);
+            }
+            let late_ns = self.random.random_range(20_000..400_000) + stands_ns;
             self.wake(t.max(self.now) + TimeNs(late_ns));
         }
     }
@@ -428,8 +455,8 @@ impl Day {
 }
 
 /// A day's minutes.
-fn run_minutes(seed: u64, minutes: i64) -> Day {
-    let mut day = Day::new(seed);
+fn run_minutes(seed: u64, minutes: i64, latency: TimeNs) -> Day {
+    let mut day = Day::new(seed, latency);
     // The first second arms.
     day.run(TimeNs(S), false);
     day.judge.balance(TimeNs(0), TimeNs(i64::MAX));
@@ -456,7 +483,7 @@ proptest! {
 
     #[test]
     fn a_day_of_fields_is_lit_safely_and_equally(seed in any::<u64>()) {
-        let day = run_minutes(seed, 24 * 60);
+        let day = run_minutes(seed, 24 * 60, TimeNs(0));
         let frames = 24 * 3600 * 60;
         prop_assert!(day.plan.frame_id > frames * 9 / 10, "{} frames were planned", day.plan.frame_id);
         prop_assert!(day.frames_missed < frames / 50, "{} frames were missed", day.frames_missed);
@@ -465,10 +492,37 @@ proptest! {
     }
 }
 
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 4, max_shrink_iters: 0, ..ProptestConfig::default() })]
+
+    /// Of up to seven refreshes, whole ones or not.
+    #[test]
+    fn a_panel_that_shows_its_video_later_is_lit_safely_and_equally(
+        seed in any::<u64>(),
+        latency_ns in 1..40 * MS,
+    ) {
+        const MINUTES: u64 = 2 * BAD_EVERY as u64;
+        let day = run_minutes(seed, MINUTES as i64, TimeNs(latency_ns));
+        let frames = MINUTES * 3600;
+        prop_assert!(day.frames_missed < frames / 50, "{} frames were missed", day.frames_missed);
+        prop_assert!(day.judge.windows > 3 * frames * 9 / 10, "{}", day.judge.windows);
+    }
+}
+
+#[test]
+fn canary_a_latency_that_the_rig_does_not_tell_lights_other_fields() {
+    for refreshes in [1, 2] {
+        let mut day = Day::new(1, TimeNs(0));
+        day.panel.latency = TimeNs(refreshes * day.panel.period.0);
+        day.run(TimeNs(S), false);
+        assert!(!day.judge.faults.is_empty(), "{refreshes} refreshes");
+    }
+}
+
 /// A few good seconds, of which any one thing is then made wrong.
 #[test]
 fn canary_the_judge_objects_to_a_single_wrong_window() {
-    let mut day = Day::new(1);
+    let mut day = Day::new(1, TimeNs(0));
     day.kept = Some(Default::default());
     day.run(TimeNs(4 * S), false);
     let (shown, edges) = day.kept.take().unwrap();
@@ -477,7 +531,7 @@ fn canary_the_judge_objects_to_a_single_wrong_window() {
     let judged = |spoil: &dyn Fn(&mut Vec<Shown>, &mut Vec<LaserEdge>)| {
         let (mut shown, mut edges) = (shown.clone(), edges.clone());
         spoil(&mut shown, &mut edges);
-        let mut judge = Judge::new(day_rig().panel.settle);
+        let mut judge = Judge::new(day_rig(TimeNs(0)).panel.settle);
         let mut shown = shown.into_iter().peekable();
         for edge in edges {
             while let Some(next) = shown.next_if(|next| next.t_begin <= edge.t) {
