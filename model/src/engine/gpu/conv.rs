@@ -1,8 +1,8 @@
 //! 3x3 convolutions on the GPU, as sums over taps.
 //!
 //! Layers that read matrices multiply these, in half precision, and sum up in single precision. Of the others those
-//! that write a map of half precision multiply in half precision, two products at once, and sum up what each group of
-//! input channels gives in single precision; the rest multiply in single precision, whatever they read.
+//! that read or write a map of half precision multiply in half precision, two products at once, and sum up what each
+//! group of input channels gives in single precision; the rest multiply in single precision.
 
 use half::f16;
 
@@ -90,9 +90,8 @@ impl ConvLayer<'_> {
 
     /// `epilogue.wgsl` and `text` for the vectors of two maps.
     pub(super) fn source(&self, input: &Map, output: &Map, text: &str) -> String {
-        let half = [input, output].iter().any(|map| map.format.precision() == Precision::Half);
         let epilogue = concat!(include_str!("epilogue.wgsl"), "\n", include_str!("store.wgsl"));
-        let directive = if half { ENABLE_F16 } else { "" };
+        let directive = if products(input, output) == Precision::Half { ENABLE_F16 } else { "" };
         let [input, output] = [input, output].map(|map| map.format.precision().vector());
         format!("{directive}alias InVector = {input};\nalias OutVector = {output};\n\n{epilogue}\n{text}")
     }
@@ -217,6 +216,12 @@ impl Packing {
     }
 }
 
+/// In which precision a layer between these maps multiplies, where it does not multiply matrices.
+pub(super) fn products(input: &Map, output: &Map) -> Precision {
+    let half = [input, output].iter().any(|map| map.format.precision() == Precision::Half);
+    if half { Precision::Half } else { Precision::Single }
+}
+
 /// Adds to the plan's last stage the convolution of the first `input_groups` of `input` into `output`, a map of the
 /// same size in another buffer. Gives the buffer of the parameters, and how they lie there.
 pub(crate) fn convolve(
@@ -227,7 +232,7 @@ pub(crate) fn convolve(
     output: &Map,
 ) -> (BufferId, Packing) {
     layer.check((input, input_groups), output);
-    let precision = output.format.precision();
+    let precision = products(input, output);
     let input_blocks = input_groups.div_ceil(TILE / GROUP);
     let packing = match input.format {
         Format::HalfTiles(_) => Packing::of_tiles(input_blocks, output.groups),

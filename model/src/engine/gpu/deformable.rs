@@ -1,10 +1,10 @@
 //! Deformable 3x3 convolutions on the GPU: every tap of every pixel is read at a place of its own.
 //!
-//! Layers that read matrices interpolate in half precision and multiply matrices. Of the others those that write a map
-//! of half precision interpolate and multiply in half precision, two products at once, and sum up what each tap gives
-//! in single precision.
+//! Layers that read matrices interpolate in half precision and multiply matrices. Of the others those that read or
+//! write a map of half precision interpolate and multiply in half precision, two products at once, and sum up what each
+//! tap gives in single precision.
 
-use super::conv::{ConvLayer, TAPS};
+use super::conv::{ConvLayer, TAPS, products};
 use super::map::{Format, GROUP, Map, TILE};
 use super::matrix::{self, TilePacking};
 use super::plan::{Plan, Shader};
@@ -43,7 +43,7 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
             (source, pack_tiles(layer, input_blocks, packing), Precision::Half, packing.parts, TILE)
         }
         Format::Single | Format::Half => {
-            let precision = output.format.precision();
+            let precision = products(input, output);
             let parts = output.groups.div_ceil(MOST_PART_GROUPS);
             let part_groups = output.groups.div_ceil(parts);
             constants.extend([
