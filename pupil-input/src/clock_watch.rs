@@ -9,10 +9,11 @@ use crate::counters::{Counter, CounterSnapshot};
 const ODD_DRIFT_PPM: f64 = 20_000.0;
 /// For so long the drift must have been so large.
 const ODD_FOR: TimeNs = TimeNs(5_000_000_000);
-/// This many resets, and within how long a time, are no accidents.
+/// This many resets within [`COUNTED_WITHIN`] are no accidents.
 const MANY_RESETS: u64 = 3;
-/// And this many leaps; a stream begins with one or two.
+/// Nor are this many leaps; a stream begins with one or two.
 const MANY_LEAPS: u64 = 10;
+/// Resets and leaps are counted anew after this.
 const COUNTED_WITHIN: TimeNs = TimeNs(10_000_000_000);
 
 /// Follows what is found of a tracker's clock, and says once that it cannot be right. Pure: it reads no clock.

@@ -12,8 +12,8 @@ use crate::spec::HostPort;
 /// A sender that was silent for so long may be followed by another.
 const SENDER_LASTS: Duration = Duration::from_secs(2);
 
-/// A port of a sender from which a sample comes while it is among its newest, as many as these, is a port of its own,
-/// and no other port of that sender is followed while it lasts. Some take a new port for each datagram.
+/// The newest ports from which samples came, by their number. A sender whose port is still among them when its next
+/// sample comes keeps that port, and is followed there alone; others take a new port for each datagram.
 const PORTS_REMEMBERED: usize = 8;
 
 /// A group is joined again after so long without a datagram: the membership goes with the network interface, and does

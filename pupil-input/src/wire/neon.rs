@@ -34,8 +34,8 @@ use crate::SampleEye;
 pub(crate) const MAX_TEXT_BYTES: usize = 4096;
 /// Bytes of the longest packet. The gaze stream's have 101; after rubbish no more than this can be swallowed.
 const MAX_PACKET_BYTES: usize = 256;
-/// The phone's clock is ahead of the newest packet's time by this at most, nanoseconds; one further ahead, or behind
-/// it, is another clock.
+/// The phone's clock is off the newest packet's time by this at most, either way, in nanoseconds; one that is further
+/// off is another clock.
 const CLOCKS_ALIKE: i128 = 500_000_000;
 const FRAME_HEADER_BYTES: usize = 4;
 const RTP_HEADER_BYTES: usize = 12;
