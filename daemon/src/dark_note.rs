@@ -61,6 +61,25 @@ pub(crate) enum Found {
     Unreadable(String),
 }
 
+impl Found {
+    /// Why the lasers stay dark, if they must, with what lets them be lit where there is a note, and where that cannot
+    /// be known.
+    pub(crate) fn why_dark(&self, if_noted: &str, if_unknown: &str) -> Option<String> {
+        let why = match self {
+            Self::Nothing => return None,
+            Self::Note(note) => format!(
+                "`holod ctl lasers dark` put them out before this holod was started, as {} says; {if_noted}",
+                note.display()
+            ),
+            Self::Unreadable(error) => format!(
+                "it cannot be known whether `holod ctl lasers dark` put them out before this holod was started: {error}; \
+                 let this user read that folder{if_unknown}"
+            ),
+        };
+        Some(format!("the lasers stay dark: {why}"))
+    }
+}
+
 /// What became of a note that was to be left.
 #[derive(Debug, Default)]
 pub(crate) struct Left {

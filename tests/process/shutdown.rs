@@ -195,6 +195,11 @@ fn what_a_person_put_out_stays_dark_after_a_failure_and_is_lit_after_an_end_in_o
     daemon.signal(Signal::KILL);
     drop(daemon);
     let lit_before = laser_box.edges().len();
+    let pattern =
+        || holod(&["pattern", "level", "40", "--config", "rig.toml", "--output", "headless", "--duration", "1s"]);
+    let dark = pattern();
+    assert!(dark.status.success() && dark.stderr.contains("the lasers stay dark"), "{dark:?}");
+    assert_eq!(laser_box.edges().len(), lit_before, "a pattern is not lit either");
 
     let daemon = Daemon::start(HOLOD, &args, laser_box.folder.path());
     kept_dark(true);
@@ -213,6 +218,9 @@ fn what_a_person_put_out_stays_dark_after_a_failure_and_is_lit_after_an_end_in_o
     assert!(wait_until(Duration::from_secs(30), || laser_box.edges().len() > lit_before), "lit after an end in order");
     daemon.signal(Signal::TERM);
     assert!(daemon.wait(Duration::from_secs(20)).status.success());
+    let lit_before = laser_box.edges().len();
+    let lit = pattern();
+    assert!(lit.status.success() && laser_box.edges().len() > lit_before, "{lit:?}");
 }
 
 /// A service and a run by hand have no folder in common but the shared one, and call the port by other names.

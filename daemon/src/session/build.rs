@@ -184,7 +184,10 @@ fn open_bench_dark(
     if !matches!(found, Found::Nothing) {
         output.control.keep_dark(Some(DarkReason::Asked));
     }
-    warn_of_dark_note(&found);
+    let if_unknown = ", or look whether they may be lit: `holod ctl lasers arm`";
+    if let Some(why) = found.why_dark("`holod ctl lasers arm` lets them be lit", if_unknown) {
+        tracing::warn!("{why}");
+    }
     if let LaserDriver::Serial { path, .. } = driver
         && let Some(warning) = adapter_delay_warning("laser", path)
     {
@@ -197,21 +200,6 @@ fn open_bench_dark(
         .dark_switch()
         .install_panic_hook(host_now, || holod_model::gpu::panic_is_caught() || control::panic_is_caught());
     Ok(Bench { output, dark_note, found, stall_timeout: options.stall_timeout })
-}
-
-fn warn_of_dark_note(found: &Found) {
-    match found {
-        Found::Nothing => {}
-        Found::Note(note) => tracing::warn!(
-            "the lasers stay dark: `holod ctl lasers dark` put them out before this holod was started, as {} says; `holod \
-             ctl lasers arm` lets them be lit",
-            note.display()
-        ),
-        Found::Unreadable(error) => tracing::warn!(
-            "the lasers stay dark: it cannot be known whether `holod ctl lasers dark` put them out before this holod was \
-             started: {error}; let this user read that folder, or look whether they may be lit: `holod ctl lasers arm`"
-        ),
-    }
 }
 
 /// Everything that has been opened for a run, before its first frame.

@@ -18,6 +18,7 @@ use rtrb::Consumer;
 use serde::{Serialize, Serializer};
 
 use crate::cli::PatternTarget;
+use crate::dark_note::DarkNote;
 use crate::failure::{Exit, Failure};
 use crate::session::{LaserBoxWatch, NO_ACKNOWLEDGEMENT, PANEL_HANGS, Signals, SleepWatch, not_dark};
 use crate::setup;
@@ -45,6 +46,8 @@ pub(super) struct Shown {
     /// Why the last field that was not lit was not.
     #[serde(serialize_with = "in_words")]
     dark: Option<DarkReason>,
+    /// Windows that the laser box heard of after their beginning.
+    lit_in_part: u64,
     pub(super) lasers_dark: bool,
     flat_presented: bool,
 }
@@ -82,7 +85,13 @@ pub(super) fn show(
     let laser_box = LaserBoxWatch::new(output.laser_faults, output.laser_watch);
     let switch = output.control.dark_switch();
     switch.install_panic_hook(host_now, || false);
-    if to.dark {
+    let if_noted = "where they may be lit, start holod and `holod ctl lasers arm`, or take that file away";
+    let noted = DarkNote::on(&rig.lasers.driver).look().why_dark(if_noted, "");
+    if let Some(why) = noted.as_ref().filter(|_| !to.dark) {
+        tracing::warn!("{why}");
+    }
+    let is_dark = to.dark || noted.is_some();
+    if is_dark {
         switch.dark(DarkReason::Asked);
     } else if rig.lasers.driver != LaserDriver::Simulated && !matches!(spec, OutputSpec::Headless(_)) {
         tracing::warn!(
@@ -90,7 +99,7 @@ pub(super) fn show(
         );
     }
     let sleep = SleepWatch::begin(&rig.lasers.driver);
-    sleep.may_be_lit(!to.dark);
+    sleep.may_be_lit(!is_dark);
     let planes = Colour::ALL.map(|colour| levels.unpack_colour(colour).levels);
     let t_begin = host_now();
     let mut pacer = Pacer::new(pacing, t_begin);
@@ -103,7 +112,7 @@ pub(super) fn show(
         laser_box,
         signals,
         sleep,
-        is_dark: to.dark,
+        is_dark,
         t_begin,
         duration: to.duration.map(|duration| TimeNs(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX))),
     };
@@ -206,7 +215,8 @@ impl Bench {
     /// Puts the lasers out and ends the output.
     fn end(mut self, mut shown: Shown, ended: Result<String, Failure>) -> Result<Shown, Failure> {
         shown.duration_s = (host_now() - self.t_begin).seconds();
-        shown.refresh_hz = self.control.counts().refresh_hz;
+        let counts = self.control.counts();
+        (shown.refresh_hz, shown.lit_in_part) = (counts.refresh_hz, counts.lit_in_part);
         self.signals.lasers_go_out();
         let down = self.control.shutdown();
         self.signals.lasers_are_out();
@@ -245,6 +255,13 @@ impl fmt::Display for Shown {
                 0 => writeln!(f, "{colour}: {fields} fields, {} of them lit", self.lit[colour])?,
                 on => writeln!(f, "{colour}: {fields} fields, its laser on in {on} of them as far as it was told")?,
             }
+        }
+        if self.lit_in_part > 0 {
+            writeln!(
+                f,
+                "lit in part: {} windows, of which the laser box heard after their beginning",
+                self.lit_in_part
+            )?;
         }
         if let Some(reason) = self.dark {
             writeln!(f, "not lit, last: {reason}")?;
