@@ -5,7 +5,7 @@ use holod_pupil_input::PupilState;
 /// What the pupil of a frame rests on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FrameState {
-    /// The tracker's estimate at the time at which the frame was begun.
+    /// The tracker's estimate, as it stood when the frame was begun.
     Estimated(PupilState),
     /// A diameter that a person has set in place of the tracker's.
     Fixed,

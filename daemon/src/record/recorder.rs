@@ -422,13 +422,9 @@ mod tests {
 
     use super::*;
     use crate::cli::Cli;
-    use crate::frame_record::FrameOrders;
-    use crate::frame_state::FrameState;
     use crate::record::{FRAMES, ORDERS};
     use crate::snapshot::RecordCondition;
-    use crate::source::PictureTag;
     use holod_calibration::PupilDiameter;
-    use holod_pupil_input::PupilState;
     use holod_slm_output::PanelEncoder;
 
     fn recorder(folder: &Path) -> Recorder {
@@ -446,23 +442,13 @@ mod tests {
 
     fn frame(number: u64) -> FrameRecord {
         FrameRecord {
-            frame: number,
-            t_sample: None,
-            pupil_raw_mm: None,
-            pupil: PupilDiameter::from_mm(3.0),
             pupil_estimate: None,
-            pupil_state: FrameState::Estimated(PupilState::Tracking),
             t_wake: TimeNs(1),
             t_render_begin: TimeNs(2),
             t_render_end: TimeNs(3),
             t_submit: TimeNs(4),
             t_desired_present: TimeNs(5),
-            picture: PictureTag::default(),
-            keep: None,
-            amplitude_constant: 1.0,
-            orders: FrameOrders::default(),
-            levels_xxh3: None,
-            is_computed: true,
+            ..FrameRecord::of_pupil(number, PupilDiameter::from_mm(3.0))
         }
     }
 
