@@ -14,7 +14,7 @@ pub mod lut_fit;
 mod png_bits;
 mod quantile;
 pub mod rig;
-pub mod toml_source;
+pub mod toml_reader;
 mod units;
 
 pub use atomic_write::{folder_of, special_file, write_atomically};

@@ -8,7 +8,7 @@ use holod_calibration::rig::{
     Eye, LaserDriver, LevelPhase, Meaning, Orientation, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign,
     Provenance, Rig, RigError, TextLaserProfile, VideoMargins, WeightsChoice,
 };
-use holod_calibration::toml_source::Fault;
+use holod_calibration::toml_reader::Fault;
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
 use image::{GrayImage, ImageBuffer, ImageFormat, Luma, Rgb, RgbImage, RgbaImage};
 use proptest::prelude::*;

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::{DEPTH_DPT, Eye, Tracker, WeightsChoice};
-use holod_calibration::toml_source::did_you_mean;
+use holod_calibration::toml_reader::did_you_mean;
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::scene::Fit;
 use holod_pupil_input::UsbIds;

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::toml_source::Fault;
+use crate::toml_reader::Fault;
 
 /// A rig file that cannot be used, with every fault that was found in it, in the order of its lines.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::toml_source::Fault;
+use crate::toml_reader::Fault;
 
 /// What is wrong with a file that the rig file names.
 pub(super) struct FileFault {

@@ -24,7 +24,7 @@ pub use text_laser::{Expected, Question, TextLaserProfile};
 
 use serde::{Deserialize, Serialize};
 
-use crate::toml_source::Fault;
+use crate::toml_reader::Fault;
 use crate::{Colour, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 
 /// Reads the `tracker.spec` of a rig file that lies in a folder, where relative paths start: gives it as it is meant, or

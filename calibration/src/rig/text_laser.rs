@@ -4,7 +4,8 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 use super::RigError;
-use super::reader::{Reader, Section, Span};
+use super::reader::Span;
+use crate::toml_reader::{self, Found, Section};
 
 const FILES: [(&str, &str); 2] = [
     ("cobolt", include_str!("../../profiles/lasers/cobolt.toml")),
@@ -113,48 +114,41 @@ impl TextLaserProfile {
     /// # Errors
     /// [`RigError`] with every fault.
     pub fn parse(text: &str, origin: &Path) -> Result<Self, RigError> {
-        Reader::read(text, read).map_err(|faults| RigError { origin: origin.display().to_string(), faults })
+        toml_reader::read(text, read).map_err(|faults| RigError { origin: origin.display().to_string(), faults })
     }
 }
 
-fn read<'a>(reader: &Reader<'a>, root: Section<'a>) -> Option<TextLaserProfile> {
-    reader.reject_unknown(root, &LAYOUT, &[]);
-    let description = reader.required_text(root, "description", "maker and model");
-    let _for_people = reader.text(root, "source", "where the commands come from");
-    let [line, commands] = ["line", "commands"].map(|name| reader.section(root, name, true));
-    for section in [line, commands] {
-        reader.reject_unknown(section, &LAYOUT, &[]);
+fn read(root: &Section<'_>) -> Option<TextLaserProfile> {
+    root.check_layout(&LAYOUT, &[]);
+    let description = root.required_text("description", "maker and model");
+    let _for_people = root.text("source", "where the commands come from");
+    let [line, commands] = ["line", "commands"].map(|name| root.required_section(name));
+    for section in [&line, &commands] {
+        section.check_layout(&LAYOUT, &[]);
     }
-    let baud = reader.required_integer(line, "baud", BAUD);
-    let end_of_command = read_end_of_command(reader, line);
-    let answer_timeout_ms = reader.required_integer(line, "answer_timeout_ms", ANSWER_TIMEOUT);
-    let identify = questions(reader, root, "identify");
+    let baud = line.required_integer("baud", BAUD);
+    let end_of_command = read_end_of_command(&line);
+    let answer_timeout_ms = line.required_integer("answer_timeout_ms", ANSWER_TIMEOUT);
+    let identify = questions(root, "identify");
     if identify.as_ref().is_some_and(Vec::is_empty) {
-        let advice = "add a table [[identify]] with a harmless question, so that another device is recognised".into();
-        reader.fault_in(
-            root,
-            "identify",
-            None,
-            "nothing",
-            "a question that tells this laser from other devices",
-            advice,
-        );
+        let advice = "add a table [[identify]] with a harmless question, so that another device is recognised";
+        root.fault_at("identify", None, "nothing", "a question that tells this laser from other devices", advice);
     }
-    let healthy = questions(reader, root, "healthy");
-    let prepare = command_list(reader, commands, "prepare", false);
-    let power = reader.required_text(commands, "power", "the command that sets the power");
-    let on = command_list(reader, commands, "on", true);
-    let off = command_list(reader, commands, "off", true);
-    let acknowledge = reader.required_text(commands, "acknowledge", "how it answers a command");
-    let error = reader.text(commands, "error", "how its complaints begin");
-    if let Some(power) = power {
+    let healthy = questions(root, "healthy");
+    let prepare = command_list(&commands, "prepare", false);
+    let power = commands.required_text("power", "the command that sets the power");
+    let on = command_list(&commands, "on", true);
+    let off = command_list(&commands, "off", true);
+    let acknowledge = commands.required_text("acknowledge", "how it answers a command");
+    let error = commands.text("error", "how its complaints begin");
+    if let Some(power) = &power {
         let places = power.value.matches("{power_w}").count() + power.value.matches("{power_mw}").count();
         if places != 1 {
-            let advice = "write {power_w} for watts or {power_mw} for milliwatts where the figure stands".into();
+            let advice = "write {power_w} for watts or {power_mw} for milliwatts where the figure stands";
             let found = format!("{:?}", power.value);
-            reader.fault_in(commands, "power", power.line, &found, "one {power_w} or {power_mw}", advice);
+            power.fault(&found, "one {power_w} or {power_mw}", advice);
         }
-        sendable(reader, commands, "power", power.line, power.value);
+        sendable(power);
     }
     Some(TextLaserProfile {
         description: description?.value.into(),
@@ -172,70 +166,64 @@ fn read<'a>(reader: &Reader<'a>, root: Section<'a>) -> Option<TextLaserProfile> 
     })
 }
 
-fn read_end_of_command<'a>(reader: &Reader<'a>, line: Section<'a>) -> Option<&'a str> {
+fn read_end_of_command<'a>(line: &Section<'a>) -> Option<&'a str> {
     const EXPECTED: &str = r#"one of "\r", "\n" and "\r\n""#;
-    let found = reader.required_raw_text(line, "end_of_command", EXPECTED)?;
-    if ["\r", "\n", "\r\n"].contains(&found.value) {
-        return Some(found.value);
+    let found = line.require("end_of_command", EXPECTED)?;
+    let end = found.raw_text(EXPECTED)?;
+    if ["\r", "\n", "\r\n"].contains(&end) {
+        return Some(end);
     }
-    reader.fault_in(line, "end_of_command", found.line, &format!("{:?}", found.value), EXPECTED, "choose one".into());
+    found.fault(format!("{end:?}"), EXPECTED, "choose one");
     None
 }
 
-/// Notes a fault where `text` cannot be sent as one line.
-fn sendable(reader: &Reader<'_>, section: Section<'_>, key: &str, line: Option<usize>, text: &str) {
+/// Notes a fault where a text cannot be sent as one line.
+fn sendable(found: &Found<'_, &str>) {
+    let text = found.value;
     if text.len() > TEXT_BYTES_MAX || !text.bytes().all(|byte| (b' '..=b'~').contains(&byte)) {
         let expected = format!("printable ASCII, {TEXT_BYTES_MAX} characters at most");
-        let advice = "write one command without its line end".into();
-        reader.fault_in(section, key, line, &format!("{text:?}"), &expected, advice);
+        let advice = "write one command without its line end";
+        found.fault(format!("{text:?}"), &expected, advice);
     }
 }
 
-fn command_list<'a>(
-    reader: &Reader<'a>,
-    section: Section<'a>,
-    key: &'static str,
-    required: bool,
-) -> Option<Vec<String>> {
-    let texts = reader.text_list(section, key, required, LIST_MAX)?;
+fn command_list(section: &Section<'_>, key: &'static str, required: bool) -> Option<Vec<String>> {
+    let texts = section.text_list(key, required, LIST_MAX)?;
     for text in &texts.value {
-        sendable(reader, section, key, texts.line, text);
+        sendable(&texts.with(text));
     }
     Some(texts.value.iter().map(|text| (*text).to_owned()).collect())
 }
 
-fn questions<'a>(reader: &Reader<'a>, root: Section<'a>, name: &'static str) -> Option<Vec<Question>> {
+fn questions(root: &Section<'_>, name: &'static str) -> Option<Vec<Question>> {
     let mut questions = Vec::new();
-    for section in reader.sections(root, name, LIST_MAX)? {
-        reader.reject_unknown(section, &LAYOUT, &[]);
-        let ask = reader.required_text(section, "ask", "a harmless question");
-        let contains = reader.text(section, "contains", "a part of the right answer");
-        let one_of = if section.has("one_of") { reader.text_list(section, "one_of", false, LIST_MAX) } else { None };
-        let digits = reader.flag(section, "digits", false);
+    for section in root.sections(name, LIST_MAX)? {
+        section.check_layout(&LAYOUT, &[]);
+        let ask = section.required_text("ask", "a harmless question");
+        let contains = section.text("contains", "a part of the right answer");
+        let one_of = if section.has("one_of") { section.text_list("one_of", false, LIST_MAX) } else { None };
+        let digits = section.flag("digits", false);
         let given = usize::from(section.has("contains")) + usize::from(section.has("one_of")) + usize::from(digits);
         if given != 1 {
-            let advice = "say with one of them which answers are right".into();
+            let advice = "say with one of them which answers are right";
             let expected = "one of contains, one_of and digits = true";
-            reader.fault_in(
-                section,
+            section.fault_at(
                 "ask",
-                ask.and_then(|ask| ask.line),
+                ask.as_ref().and_then(|ask| ask.line),
                 &format!("{given} of them"),
                 expected,
                 advice,
             );
         }
-        if let Some(ask) = ask {
-            sendable(reader, section, "ask", ask.line, ask.value);
+        if let Some(ask) = &ask {
+            sendable(ask);
         }
         let otherwise = match name {
-            "healthy" => {
-                reader.text(section, "otherwise", "the command that brings the laser to where it answers like that")
-            }
+            "healthy" => section.text("otherwise", "the command that brings the laser to where it answers like that"),
             _ => None,
         };
-        if let Some(otherwise) = otherwise {
-            sendable(reader, section, "otherwise", otherwise.line, otherwise.value);
+        if let Some(otherwise) = &otherwise {
+            sendable(otherwise);
         }
         let expect = match (contains, one_of) {
             (Some(text), _) => Expected::Contains(text.value.into()),
@@ -304,7 +292,7 @@ mod tests {
             ("on = [\"l1\"]", "on = []", "commands.on", "at least one"),
             ("on = [\"l1\"]", "on = [\"l1\\r\"]", "commands.on", "without its line end"),
             ("on = [\"l1\"]", "on = \"l1\"", "commands.on", "square brackets"),
-            ("acknowledge = \"OK\"", "", "commands.acknowledge", "add acknowledge"),
+            ("acknowledge = \"OK\"", "", "commands.acknowledge", "add acknowledge to [commands]"),
         ] {
             let wrong = text.replacen(from, to, 1);
             assert_ne!(wrong, text, "{from}");
@@ -318,6 +306,13 @@ mod tests {
         assert_eq!(
             error.faults.iter().map(|fault| fault.key.as_str()).collect::<Vec<_>>(),
             ["line.baud", "commands.off"]
+        );
+        let nameless = text.replacen("description = ", "# ", 1);
+        let error = TextLaserProfile::parse(&nameless, Path::new("my.toml")).unwrap_err();
+        assert!(
+            error
+                .to_string()
+                .contains("description: found nothing; expected maker and model; add description to the top")
         );
         let no_identity =
             text.split("# It has no word").next().unwrap().to_owned() + &text[text.find("[commands]").unwrap()..];

@@ -2,15 +2,15 @@
 //!
 //! A profile is a TOML file. `profiles/README.md` in this crate describes every key; the files beside it are shipped.
 
+mod bytes;
 mod kinds;
 mod parse;
-mod reader;
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 use std::time::Duration;
 
-use holod_calibration::toml_source::{Fault, did_you_mean};
+use holod_calibration::toml_reader::{Fault, did_you_mean};
 
 use crate::size_unit::{Figures, SizeUnit};
 use crate::usb_ids::UsbIds;

@@ -3,10 +3,10 @@
 use std::cell::Cell;
 use std::time::Duration;
 
-use holod_calibration::toml_source::Fault;
+use holod_calibration::toml_reader::{self, Fault, Found, Section};
 
+use super::bytes::read_bytes;
 use super::kinds::{Context, EYES, read_wire};
-use super::reader::{Found, Reader, Section};
 use super::{Command, DEFAULT_BAUD, HidSettings, NetworkSettings, Profile, SerialSettings};
 use crate::size_unit::SizeUnit;
 use crate::usb_ids::UsbIds;
@@ -19,16 +19,16 @@ const ANSWER_WITHIN_MS: i64 = 1000;
 
 /// Parses a profile, or tells all that is wrong with it, in the order of its lines.
 pub(super) fn parse(text: &str) -> Result<Profile, Vec<Fault>> {
-    Reader::read(text, read)
+    toml_reader::read(text, read)
 }
 
 fn read(root: &Section<'_>) -> Option<Profile> {
     if let Some(found) = root.require("format", &format!("\"{SCHEMA}\"")) {
-        root.reader().choose(&found, &[(SCHEMA, ())]);
+        found.choose(&[(SCHEMA, ())]);
     }
-    let name = root.require("name", "the profile's name").and_then(|at| root.reader().text(&at, "the profile's name"));
-    let about = root.text("about", "one sentence about the tracker").unwrap_or_default();
-    let eye = root.get("eye").and_then(|found| Some(found.with(root.reader().choose(&found, &EYES)?)));
+    let name = root.required_text("name", "the profile's name");
+    let about = root.text("about", "one sentence about the tracker").map_or("", |about| about.value);
+    let eye = root.get("eye").and_then(|found| Some(found.with(found.choose(&EYES)?)));
     let rate_hz = root.positive("rate_hz").and_then(|rate_hz| Some(root.get("rate_hz")?.with(rate_hz)));
     let size_at = root.get("size").map(|found| found.with(()));
     let (unit, size) = read_size(&root.section("size"));
@@ -38,13 +38,13 @@ fn read(root: &Section<'_>) -> Option<Profile> {
     let wire = root.require("wire", "the table that says how bytes are read");
     let mm_per_unit = size.mm_per_unit;
     let context = Context { eye, rate_hz, counts_frames: Cell::new(false), size, unit, size_at };
-    let wire = wire.and_then(|wire| read_wire(&root.reader().table(&wire), &context));
+    let wire = wire.and_then(|wire| read_wire(&wire.table(), &context));
     if let Some(rate_hz) = context.rate_hz.as_ref().filter(|_| wire.is_some() && !context.counts_frames.get()) {
         let advice = "take it out, or write unit = \"frames\" where the time counts frames";
-        root.reader().fault(rate_hz, rate_hz.value, "none: no time is made from a frame counter", advice);
+        rate_hz.fault(rate_hz.value, "none: no time is made from a frame counter", advice);
     }
     root.finish();
-    let (name, about) = (name?.to_owned(), about.to_owned());
+    let (name, about) = (name?.value.to_owned(), about.to_owned());
     let (format, unit) = wire?;
     Some(Profile { name, about, unit, mm_per_unit, serial, hid, network, format })
 }
@@ -74,27 +74,25 @@ fn read_network(network: &Section<'_>) -> NetworkSettings {
 fn read_usb(section: &Section<'_>) -> Vec<UsbIds> {
     const EXPECTED: &str = "USB identities such as [\"1209:0001\"]";
     let Some(found) = section.get("usb") else { return Vec::new() };
-    let reader = section.reader();
-    let read = |item: Found<toml_edit::Item>| {
+    let read = |item: Found<'_, toml_edit::Item>| {
         let ids = item.value.as_str().map(str::parse);
         match ids {
             Some(Ok(ids)) => return Some(ids),
-            Some(Err(problem)) => reader.fault(&item, item.value.to_string().trim(), EXPECTED, problem),
-            None => reader.fault(&item, item.value.to_string().trim(), EXPECTED, "write each in quotes"),
+            Some(Err(problem)) => item.fault(item.value.to_string().trim(), EXPECTED, problem),
+            None => item.fault(item.value.to_string().trim(), EXPECTED, "write each in quotes"),
         }
         None
     };
-    reader.items(&found, EXPECTED).into_iter().filter_map(read).collect()
+    found.items(EXPECTED).into_iter().filter_map(read).collect()
 }
 
 fn read_commands(section: &Section<'_>, key: &'static str) -> Vec<Command> {
     let Some(found) = section.get(key) else { return Vec::new() };
-    let reader = section.reader();
-    let items = reader.items(&found, "commands such as [{ send = \"Go\\r\", expect = \"OK\", within_ms = 500 }]");
-    let read = |item: &Found<toml_edit::Item>| {
-        let command = reader.table(&item.with(&item.value));
-        let send = command.require("send", "the bytes to send").and_then(|send| reader.bytes(&send));
-        let expect = command.bytes("expect");
+    let items = found.items("commands such as [{ send = \"Go\\r\", expect = \"OK\", within_ms = 500 }]");
+    let read = |item: &Found<'_, toml_edit::Item>| {
+        let command = item.with(&item.value).table();
+        let send = command.require("send", "the bytes to send").and_then(|send| read_bytes(&send));
+        let expect = command.get("expect").and_then(|expect| read_bytes(&expect));
         let within_ms = command.integer("within_ms", 1..=60_000).unwrap_or(ANSWER_WITHIN_MS);
         command.finish();
         Some(Command { send: send?, expect, within: Duration::from_millis(within_ms as u64) })
@@ -107,15 +105,15 @@ fn read_size(size: &Section<'_>) -> (SizeUnit, SizeRule) {
         [("diameter", SizeKind::Diameter), ("radius", SizeKind::Radius), ("area", SizeKind::Area)];
     const UNITS: [(&str, SizeUnit); 3] =
         [("mm", SizeUnit::Millimetres), ("pixels", SizeUnit::Pixels), ("arbitrary", SizeUnit::Arbitrary)];
-    let kind = size.choice("kind", &KINDS).unwrap_or(SizeKind::Diameter);
-    let unit = size.choice("unit", &UNITS).unwrap_or_default();
+    let kind = size.choice("kind", &KINDS, false).map_or(SizeKind::Diameter, |kind| kind.value);
+    let unit = size.choice("unit", &UNITS, false).map_or(SizeUnit::default(), |unit| unit.value);
     let mm_per_unit = size.positive("mm_per_unit");
     if unit == SizeUnit::Millimetres
         && let Some(factor) = mm_per_unit.filter(|factor| *factor != 1.0)
         && let Some(found) = size.get("mm_per_unit")
     {
         let advice = "take it out, or write unit = \"pixels\" or unit = \"arbitrary\"";
-        size.reader().fault(&found, factor, "none where the unit is mm", advice);
+        found.fault(factor, "none where the unit is mm", advice);
     }
     size.finish();
     // Where the profile knows the conversion, what it gives is millimetres.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use holod_calibration::toml_source::Fault;
+use holod_calibration::toml_reader::Fault;
 
 use super::TrackerError;
 use super::job::Job;

@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use crate::rig::files::read_text;
-use crate::rig::reader::{Reader, Section, Span};
+use crate::rig::reader::Span;
 use crate::rig::{LaserDriver, Provenance, TextLaserProfile};
+use crate::toml_reader::Section;
 use crate::{Colour, PerColour};
 
 pub(super) const POWER_SLIPS: &[(&str, f64)] = &[("microwatts", 1e-3)];
@@ -34,22 +35,17 @@ const DRIVERS: [(&str, &[&str]); 4] = [
     ),
 ];
 
-pub(super) fn read_driver<'a>(
-    reader: &Reader<'a>,
-    lasers: Section<'a>,
-    folder: &Path,
-    provenance: &mut Provenance,
-) -> Option<LaserDriver> {
+pub(super) fn read_driver(lasers: &Section<'_>, folder: &Path, provenance: &mut Provenance) -> Option<LaserDriver> {
     const PORT: &str = "a serial port's path";
     let drivers: Vec<_> = DRIVERS.iter().map(|driver| (driver.0, driver)).collect();
-    let driver = reader.choice(lasers, "driver", &drivers, true);
+    let driver = lasers.choice("driver", &drivers, true);
     // Each key is read whatever the driver is, so that all its own faults are reported.
-    let device = reader.text(lasers, "device", PORT);
-    let devices = reader.texts(lasers, "devices", PORT);
-    let sync_wire = reader.flag(lasers, "sync_wire", false);
-    let full_power = reader.numbers(lasers, "full_power_mw", FULL_POWER, PerColour([lasers.has("full_power_mw"); 3]));
-    let transmission = reader.numbers(lasers, "transmission", TRANSMISSION, PerColour([false; 3]));
-    let profile = read_text_laser(reader, lasers, folder, provenance);
+    let device = lasers.text("device", PORT);
+    let devices = lasers.texts("devices", PORT);
+    let sync_wire = lasers.flag("sync_wire", false);
+    let full_power = lasers.numbers("full_power_mw", FULL_POWER, PerColour([lasers.has("full_power_mw"); 3]));
+    let transmission = lasers.numbers("transmission", TRANSMISSION, PerColour([false; 3]));
+    let profile = read_text_laser(lasers, folder, provenance);
     let driver = driver?;
     let (name, own) = *driver.value;
     let keys: BTreeSet<_> = DRIVERS.iter().flat_map(|(_, keys)| *keys).collect();
@@ -58,14 +54,14 @@ pub(super) fn read_driver<'a>(
             let of: Vec<_> = DRIVERS.iter().filter(|(_, keys)| keys.contains(key)).map(|(name, _)| *name).collect();
             let found = format!("a key that the driver \"{name}\" does not have");
             let advice = format!("take {key} out, or write driver = \"{}\"", of.join("\" or \""));
-            let line = reader.line_of_key(lasers, key);
-            reader.fault_in(lasers, key, line, &found, "only keys of the chosen driver", advice);
+            let line = lasers.line_of(key);
+            lasers.fault_at(key, line, &found, "only keys of the chosen driver", advice);
         }
     }
     let missing = |key: &str, expected: &str, example: &str| {
         if !lasers.has(key) {
             let advice = format!("write for example {example}");
-            reader.fault_in(lasers, key, driver.line, "nothing", expected, advice);
+            lasers.fault_at(key, driver.line, "nothing", expected, advice);
         }
     };
     match name {
@@ -91,18 +87,16 @@ pub(super) fn read_driver<'a>(
                 missing("profile", "how the lasers are spoken to", "profile = \"cobolt\", or profile_file");
             }
             for (index, colour) in Colour::ALL.into_iter().enumerate() {
-                let Some(path) = devices[colour] else { continue };
+                let Some(path) = &devices[colour] else { continue };
                 if devices.0[..index].iter().flatten().any(|other| other.value == path.value) {
-                    let advice = "give each laser its own port".into();
-                    let key = format!("devices.{colour}");
-                    reader.fault_in(lasers, &key, path.line, "a port named twice", "one laser to a port", advice);
+                    let advice = "give each laser its own port";
+                    path.fault("a port named twice", "one laser to a port", advice);
                 }
             }
             for colour in Colour::ALL {
-                if let (Some(share), None) = (transmission[colour], devices[colour]) {
-                    let (key, advice) =
-                        (format!("transmission.{colour}"), "name its port in devices, or take this out");
-                    reader.fault_in(lasers, &key, share.line, "that of no laser", "a laser of it", advice.into());
+                if let (Some(share), None) = (&transmission[colour], &devices[colour]) {
+                    let advice = "name its port in devices, or take this out";
+                    share.fault("that of no laser", "a laser of it", advice);
                 }
             }
             let paths = devices.map(|path| path.map(|path| path.value.into()));
@@ -115,47 +109,42 @@ pub(super) fn read_driver<'a>(
 }
 
 /// Whether the rig file accepts, in words, lasers that stay lit when holod dies.
-pub(super) fn read_acceptance<'a>(reader: &Reader<'a>, lasers: Section<'a>, driver: Option<&LaserDriver>) -> bool {
+pub(super) fn read_acceptance(lasers: &Section<'_>, driver: Option<&LaserDriver>) -> bool {
     let expected = format!("the words {ACCEPTANCE:?}");
-    let words = reader.text(lasers, "accept_no_heartbeat", &expected);
-    let accepted = words.is_some_and(|words| words.value == ACCEPTANCE);
+    let words = lasers.text("accept_no_heartbeat", &expected);
+    let accepted = words.as_ref().is_some_and(|words| words.value == ACCEPTANCE);
     let needed = driver.is_some_and(|driver| !driver.has_heartbeat());
     if needed && !accepted {
-        let found = words.map_or("nothing".into(), |words| format!("{:?}", words.value));
+        let found = words.as_ref().map_or("nothing".into(), |words| format!("{:?}", words.value));
         let advice = format!(
             "these lasers have no heartbeat: they stay lit when holod is killed or the computer hangs. Where the bench is \
              safe with that, write accept_no_heartbeat = {ACCEPTANCE:?}"
         );
         let line = words.and_then(|words| words.line);
-        reader.fault_in(lasers, "accept_no_heartbeat", line, &found, &expected, advice);
+        lasers.fault_at("accept_no_heartbeat", line, &found, &expected, advice);
     }
     accepted
 }
 
 /// The profile that `profile` or `profile_file` names.
-fn read_text_laser<'a>(
-    reader: &Reader<'a>,
-    lasers: Section<'a>,
-    folder: &Path,
-    provenance: &mut Provenance,
-) -> Option<TextLaserProfile> {
+fn read_text_laser(lasers: &Section<'_>, folder: &Path, provenance: &mut Provenance) -> Option<TextLaserProfile> {
     let choices: Vec<_> = TextLaserProfile::names().map(|name| (name, name)).collect();
-    let named = reader.choice(lasers, "profile", &choices, false);
-    let file = reader.text(lasers, "profile_file", "a TOML file's path");
-    if let (Some(_), Some(file)) = (named, file) {
-        let advice = "remove profile, or profile_file".into();
-        reader.fault_in(lasers, "profile_file", file.line, "a second profile", "one profile", advice);
+    let named = lasers.choice("profile", &choices, false);
+    let file = lasers.text("profile_file", "a TOML file's path");
+    if let (Some(_), Some(file)) = (&named, &file) {
+        let advice = "remove profile, or profile_file";
+        file.fault("a second profile", "one profile", advice);
     }
     let Some(file) = file else { return TextLaserProfile::named(named?.value).cloned() };
     let path = provenance.laser_profile_file.insert(folder.join(file.value));
-    let text = reader.of_file(lasers, "profile_file", file.line, read_text(path))?;
+    let text = file.of_file(read_text(path))?;
     match TextLaserProfile::parse(&text, path) {
         Ok(profile) => Some(profile),
         Err(error) => {
             for fault in error.faults {
                 let place = fault.line.map_or(String::new(), |line| format!(" line {line}"));
                 let found = format!("{}{place}, {}: {}", path.display(), fault.key, fault.found);
-                reader.fault_in(lasers, "profile_file", file.line, &found, &fault.expected, fault.advice);
+                file.fault(&found, &fault.expected, fault.advice);
             }
             None
         }

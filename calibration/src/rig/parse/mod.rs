@@ -26,8 +26,8 @@ pub(super) use tracker::SCALE;
 use tracker::read_tracker;
 
 use super::profile::PanelProfile;
-use super::reader::{Reader, Section};
 use super::{LaserDriver, Panel, Provenance, Rig, RigError, SpecReader};
+use crate::toml_reader::{self, Section};
 
 /// Every key of a rig file, by table.
 const LAYOUT: [(&str, &[&str]); 6] = [
@@ -107,7 +107,7 @@ const RETIRED: [(&str, &str, &str); 1] =
 
 /// Parses `text`; relative paths in it start at the folder of `origin`.
 pub(super) fn parse(text: &str, origin: &Path, read_spec: SpecReader<'_>) -> Result<Rig, RigError> {
-    let rig = Reader::read(text, |reader, root| read_rig(reader, root, text, origin, read_spec));
+    let rig = toml_reader::read(text, |root| read_rig(root, text, origin, read_spec));
     rig.map_err(|faults| RigError { origin: origin.display().to_string(), faults })
 }
 
@@ -115,23 +115,17 @@ pub(super) fn parse(text: &str, origin: &Path, read_spec: SpecReader<'_>) -> Res
 pub(super) fn laser_driver(text: &str, origin: &Path) -> Option<LaserDriver> {
     let mut driver = None;
     let folder = origin.parent().unwrap_or(Path::new(""));
-    let _faults = Reader::read(text, |reader, root| {
-        let lasers = reader.section(root, "lasers", true);
-        driver = read_driver(reader, lasers, folder, &mut Provenance::default());
+    let _faults = toml_reader::read(text, |root| {
+        let lasers = root.required_section("lasers");
+        driver = read_driver(&lasers, folder, &mut Provenance::default());
         Some(())
     });
     driver
 }
 
-fn read_rig<'a>(
-    reader: &Reader<'a>,
-    root: Section<'a>,
-    text: &str,
-    origin: &Path,
-    read_spec: SpecReader<'_>,
-) -> Option<Rig> {
-    reader.reject_unknown(root, &LAYOUT, &RETIRED);
-    let name = match reader.text(root, "name", "a name for logs and reports") {
+fn read_rig(root: &Section<'_>, text: &str, origin: &Path, read_spec: SpecReader<'_>) -> Option<Rig> {
+    root.check_layout(&LAYOUT, &RETIRED);
+    let name = match root.text("name", "a name for logs and reports") {
         Some(name) => name.value.to_owned(),
         None => origin.file_stem().map_or_else(|| "rig".into(), |stem| stem.to_string_lossy().into_owned()),
     };
@@ -139,36 +133,37 @@ fn read_rig<'a>(
     let built_in = !["panel", "optics", "lasers"].into_iter().any(|name| root.has(name))
         && ["tracker", "model"].into_iter().any(|name| root.has(name));
     let [panel, optics, lasers, tracker, model] =
-        [("panel", true), ("optics", true), ("lasers", true), ("tracker", false), ("model", false)]
-            .map(|(name, required)| reader.section(root, name, required && !built_in));
-    for section in [panel, optics, lasers, tracker, model] {
-        reader.reject_unknown(section, &LAYOUT, &RETIRED);
+        [("panel", true), ("optics", true), ("lasers", true), ("tracker", false), ("model", false)].map(
+            |(name, required)| if required && !built_in { root.required_section(name) } else { root.section(name) },
+        );
+    for section in [&panel, &optics, &lasers, &tracker, &model] {
+        section.check_layout(&LAYOUT, &RETIRED);
     }
     let folder = origin.parent().unwrap_or(Path::new(""));
     let mut provenance =
         Provenance { origin: origin.display().to_string(), text_hash: Some(fnv1a(text)), ..Provenance::default() };
 
     if built_in {
-        let tracker = read_tracker(reader, tracker, &|spec| read_spec(spec, folder));
-        let model = read_model(reader, model, folder);
+        let tracker = read_tracker(&tracker, &|spec| read_spec(spec, folder));
+        let model = read_model(&model, folder);
         return Some(Rig { name, tracker: tracker?, model: model?, provenance, ..Rig::default() });
     }
     // Each part is read whatever became of the others, so that one report holds all the faults.
-    let profile = read_profile(reader, panel);
+    let profile = read_profile(&panel);
     provenance.panel_profile = profile.map(|profile| profile.name);
-    let mut panel = panel.with_profile(profile.map(PanelProfile::values));
+    let mut panel = panel.with_behind(profile.map(PanelProfile::values));
     if panel.has("profile") && profile.is_none() {
         panel = panel.excusing(&PROFILE_KEYS);
     }
-    let pixels = read_pixels(reader, panel);
-    let video_margins = read_video_margins(reader, panel, pixels.map(|(resolution, _)| resolution));
-    let timing = read_field_timing(reader, panel);
-    let levels = read_levels(reader, panel, timing.map(|timing| timing.mode));
-    let phase = read_phase(reader, panel, levels, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
-    let optics = read_optics(reader, optics, pixels);
-    let lasers = read_lasers(reader, lasers, timing, folder, &mut provenance);
-    let tracker = read_tracker(reader, tracker, &|spec| read_spec(spec, folder));
-    let model = read_model(reader, model, folder);
+    let pixels = read_pixels(&panel);
+    let video_margins = read_video_margins(&panel, pixels.map(|(resolution, _)| resolution));
+    let timing = read_field_timing(&panel);
+    let levels = read_levels(&panel, timing.map(|timing| timing.mode));
+    let phase = read_phase(&panel, levels, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
+    let optics = read_optics(&optics, pixels);
+    let lasers = read_lasers(&lasers, timing, folder, &mut provenance);
+    let tracker = read_tracker(&tracker, &|spec| read_spec(spec, folder));
+    let model = read_model(&model, folder);
 
     let (timing, (bit_depth, packing), phase) = (timing?, levels?, phase?);
     let (geometry, relay_magnification) = optics?;
@@ -178,7 +173,7 @@ fn read_rig<'a>(
         field_order: timing.field_order,
         channel_order: timing.channel_order,
         frames_per_colour: timing.frames_per_colour,
-        settle: milliseconds(timing.settle_ms.value),
+        settle: milliseconds(timing.settle_ms),
         latency: milliseconds(timing.latency_ms),
         bit_depth,
         packing,

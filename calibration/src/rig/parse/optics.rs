@@ -1,7 +1,8 @@
 //! `[optics]`.
 
 use super::figures::shown;
-use crate::rig::reader::{Found, Reader, Section, Span};
+use crate::rig::reader::Span;
+use crate::toml_reader::{Found, Section};
 use crate::{Dioptres, DisplayGeometry, Metres, PerColour, Resolution};
 
 /// What each colour's figure in `optics.wavelengths_nm` may be.
@@ -16,39 +17,37 @@ pub const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
 /// Below this a volume's two ends look alike to any eye.
 const DEPTH_RANGE_MIN_DPT: f64 = 0.1;
 
-pub(super) fn read_optics<'a>(
-    reader: &Reader<'a>,
-    optics: Section<'a>,
+pub(super) fn read_optics(
+    optics: &Section<'_>,
     pixels: Option<(Resolution, Metres)>,
 ) -> Option<(DisplayGeometry, f64)> {
-    let wavelengths_nm = reader.numbers(optics, "wavelengths_nm", WAVELENGTH, PerColour([true; 3]));
-    let focal_length_mm = reader.required_number(optics, "eyepiece_focal_length_mm", FOCAL_LENGTH);
-    let magnification = match reader.number(optics, "relay_magnification", MAGNIFICATION) {
-        None if !optics.has("relay_magnification") => Some(Found { value: 1.0, line: None }),
+    let wavelengths_nm = optics.numbers("wavelengths_nm", WAVELENGTH, PerColour([true; 3]));
+    let focal_length_mm = optics.required_number("eyepiece_focal_length_mm", FOCAL_LENGTH);
+    let magnification = match optics.number("relay_magnification", MAGNIFICATION) {
+        None if !optics.has("relay_magnification") => Some(optics.assumed("relay_magnification", 1.0)),
         read => read,
     };
-    let depth_far = read_depth(reader, optics, ["depth_far_m", "depth_far_dpt"], DisplayGeometry::DEFAULT.depth_far);
-    let depth_near =
-        read_depth(reader, optics, ["depth_near_m", "depth_near_dpt"], DisplayGeometry::DEFAULT.depth_near);
+    let depth_far = read_depth(optics, ["depth_far_m", "depth_far_dpt"], DisplayGeometry::DEFAULT.depth_far);
+    let depth_near = read_depth(optics, ["depth_near_m", "depth_near_dpt"], DisplayGeometry::DEFAULT.depth_near);
 
-    if let [Some(red), Some(green), Some(blue)] = wavelengths_nm.0
+    if let [Some(red), Some(green), Some(blue)] = &wavelengths_nm.0
         && !(red.value > green.value && green.value > blue.value)
     {
         let found = format!("{}, {} and {} nm", red.value, green.value, blue.value);
         let expected = "red longer than green, green longer than blue";
-        reader.fault_in(optics, "wavelengths_nm", red.line, &found, expected, "put each under its own colour".into());
+        optics.fault_at("wavelengths_nm", red.line, &found, expected, "put each under its own colour");
     }
-    if let (Some(far), Some(near)) = (depth_far, depth_near) {
+    if let (Some(far), Some(near)) = (&depth_far, &depth_near) {
         let range_dpt = near.value.0 - far.value.0;
         let line = near.line.or(far.line);
         let found = format!("near {} and far {} dioptres", shown(near.value.0), shown(far.value.0));
         if range_dpt < 0.0 {
-            let advice = "exchange the near and the far end".into();
-            reader.fault_in(optics, "depth_near", line, &found, "the near end nearer than the far end", advice);
+            let advice = "exchange the near and the far end";
+            optics.fault_at("depth_near", line, &found, "the near end nearer than the far end", advice);
         } else if range_dpt < DEPTH_RANGE_MIN_DPT {
             let expected = format!("ends at least {DEPTH_RANGE_MIN_DPT} dioptres apart");
-            let advice = "depths are in metres or dioptres: 35 cm is depth_near_m = 0.35".into();
-            reader.fault_in(optics, "depth_near", line, &found, &expected, advice);
+            let advice = "depths are in metres or dioptres: 35 cm is depth_near_m = 0.35";
+            optics.fault_at("depth_near", line, &found, &expected, advice);
         }
     }
     let [Some(red), Some(green), Some(blue)] = wavelengths_nm.0 else { return None };
@@ -58,8 +57,8 @@ pub(super) fn read_optics<'a>(
     if !(FOCAL_LENGTH.min..=FOCAL_LENGTH.max).contains(&from_panel_mm) {
         let found = format!("{}, which makes {} mm of the eyepiece", shown(magnification.value), shown(from_panel_mm));
         let expected = format!("from {} to {} mm, seen from the panel", FOCAL_LENGTH.min, FOCAL_LENGTH.max);
-        let advice = "write the size of the panel's image over that of the panel".into();
-        reader.fault_in(optics, "relay_magnification", magnification.line, &found, &expected, advice);
+        let advice = "write the size of the panel's image over that of the panel";
+        magnification.fault(&found, &expected, advice);
     }
     let geometry = DisplayGeometry {
         resolution,
@@ -74,21 +73,20 @@ pub(super) fn read_optics<'a>(
 
 /// One end of the depth range, in metres or in dioptres; `default` where the rig file gives neither.
 fn read_depth<'a>(
-    reader: &Reader<'a>,
-    optics: Section<'a>,
+    optics: &Section<'a>,
     [key_m, key_dpt]: [&'static str; 2],
     default: Dioptres,
-) -> Option<Found<Dioptres>> {
+) -> Option<Found<'a, Dioptres>> {
     if !optics.has(key_m) && !optics.has(key_dpt) {
-        return Some(Found { value: default, line: None });
+        return Some(optics.assumed(key_dpt, default));
     }
-    let metres = reader.number(optics, key_m, DEPTH_M);
-    let dioptres = reader.number(optics, key_dpt, DEPTH_DPT);
+    let metres = optics.number(key_m, DEPTH_M);
+    let dioptres = optics.number(key_dpt, DEPTH_DPT);
     if optics.has(key_m) && optics.has(key_dpt) {
-        let line = dioptres.or(metres).and_then(|depth| depth.line);
+        let line = dioptres.as_ref().or(metres.as_ref()).and_then(|depth| depth.line);
         let expected = "the depth once, in metres or in dioptres";
-        reader.fault_in(optics, key_dpt, line, &format!("{key_m} as well"), expected, "take one of the two out".into());
+        optics.fault_at(key_dpt, line, &format!("{key_m} as well"), expected, "take one of the two out");
     }
-    let metres = metres.map(|found| Found { value: Dioptres(1.0 / found.value), line: found.line });
-    metres.or(dioptres.map(|found| Found { value: Dioptres(found.value), line: found.line }))
+    let metres = metres.map(|found| found.with(Dioptres(1.0 / found.value)));
+    metres.or(dioptres.map(|found| found.with(Dioptres(found.value))))
 }

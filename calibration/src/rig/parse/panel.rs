@@ -2,7 +2,8 @@
 
 use crate::rig::VideoMargins;
 use crate::rig::profile::PanelProfile;
-use crate::rig::reader::{Reader, Section, Span};
+use crate::rig::reader::Span;
+use crate::toml_reader::Section;
 use crate::{Metres, Resolution};
 
 /// The keys that a panel profile gives.
@@ -25,44 +26,40 @@ const MARGIN: Span = Span::new(0.0, 16384.0, "px");
 pub const PITCH: Span =
     Span::new(1.0, 50.0, "µm").slips(&[("metres", 1e6), ("millimetres", 1e3), ("nanometres", 1e-3)]);
 
-pub(super) fn read_profile<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<&'static PanelProfile> {
+pub(super) fn read_profile(panel: &Section<'_>) -> Option<&'static PanelProfile> {
     let choices: Vec<_> = PanelProfile::all().iter().map(|profile| (profile.name, profile)).collect();
-    Some(reader.choice(panel, "profile", &choices, false)?.value)
+    Some(panel.choice("profile", &choices, false)?.value)
 }
 
-pub(super) fn read_pixels<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<(Resolution, Metres)> {
+pub(super) fn read_pixels(panel: &Section<'_>) -> Option<(Resolution, Metres)> {
     let [width, height] = ["width_px", "height_px"].map(|key| {
-        let pixels = reader.required_integer(panel, key, PIXELS)?;
+        let pixels = panel.required_integer(key, PIXELS)?;
         if pixels.value % 2 == 0 {
             return Some(pixels.value);
         }
-        let advice = "leave out the last row or column of the panel".into();
-        reader.fault_in(panel, key, pixels.line, &pixels.value.to_string(), "an even number of pixels", advice);
+        let advice = "leave out the last row or column of the panel";
+        pixels.fault(pixels.value, "an even number of pixels", advice);
         None
     });
-    let pitch_um = reader.required_number(panel, "pixel_pitch_um", PITCH);
+    let pitch_um = panel.required_number("pixel_pitch_um", PITCH);
     Some((Resolution { width: width?, height: height? }, Metres(pitch_um?.value / 1e6)))
 }
 
-pub(super) fn read_video_margins<'a>(
-    reader: &Reader<'a>,
-    panel: Section<'a>,
-    resolution: Option<Resolution>,
-) -> Option<VideoMargins> {
+pub(super) fn read_video_margins(panel: &Section<'_>, resolution: Option<Resolution>) -> Option<VideoMargins> {
     // Before the panel, and behind it.
     let read = |[size_key, first_key, own_key]: [&'static str; 3], own: Option<usize>| {
-        let first = if panel.gives(first_key) { reader.required_integer(panel, first_key, MARGIN)?.value } else { 0 };
+        let first = if panel.gives(first_key) { panel.required_integer(first_key, MARGIN)?.value } else { 0 };
         if !panel.gives(size_key) {
             if first == 0 {
                 return Some((0, 0));
             }
-            let line = reader.line_of_key(panel, first_key);
+            let line = panel.line_of(first_key);
             let expected = format!("{size_key} beside it, the size of the video frame");
             let advice = format!("add {size_key}, or take {first_key} out");
-            reader.fault_in(panel, first_key, line, &format!("{first_key} alone"), &expected, advice);
+            panel.fault_at(first_key, line, &format!("{first_key} alone"), &expected, advice);
             return None;
         }
-        let size = reader.required_integer(panel, size_key, PIXELS)?;
+        let size = panel.required_integer(size_key, PIXELS)?;
         let behind = size.value.checked_sub(first + own?);
         if behind.is_none() {
             let least = first + own?;
@@ -71,7 +68,7 @@ pub(super) fn read_video_margins<'a>(
                 Some(_) => format!("{size_key} is the size of the mode that the panel's video input takes"),
                 None => format!("the panel's profile gives {size_key}: give it here, or take the profile out"),
             };
-            reader.fault_in(panel, size_key, size.line, &format!("{} px", size.value), &expected, advice);
+            panel.fault_at(size_key, size.line, &format!("{} px", size.value), &expected, advice);
         }
         Some((first, behind?))
     };

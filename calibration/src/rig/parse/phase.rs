@@ -9,8 +9,9 @@ use super::figures::shown;
 use crate::rig::files::{PICTURE_BYTES_MAX, TEXT_BYTES_MAX, read_bytes, text_of};
 use crate::rig::flatness::{self, GrayScale};
 use crate::rig::meaning::is_in_order;
-use crate::rig::reader::{Found, Reader, Section, Span};
+use crate::rig::reader::Span;
 use crate::rig::{LevelPhase, Orientation, OutOfStroke, Packing, PanelMode, PhaseSign, Provenance, TableFile, lut};
+use crate::toml_reader::{Found, Section};
 use crate::{Colour, PerColour, Resolution};
 
 const BIT_DEPTH: Span = Span::new(8.0, 16.0, "bits");
@@ -20,32 +21,28 @@ const GRAY_OF_2PI: Span = Span::new(16.0, 65536.0, "");
 const STROKE_TOLERANCE: f64 = 0.02;
 
 /// The bits of a level and where they travel on the video link.
-pub(super) fn read_levels<'a>(
-    reader: &Reader<'a>,
-    panel: Section<'a>,
-    mode: Option<PanelMode>,
-) -> Option<(u8, Packing)> {
-    let bits = reader.required_integer(panel, "bit_depth", BIT_DEPTH);
+pub(super) fn read_levels(panel: &Section<'_>, mode: Option<PanelMode>) -> Option<(u8, Packing)> {
+    let bits = panel.required_integer("bit_depth", BIT_DEPTH);
     let packings = Packing::ALL.map(|packing| (packing.name(), packing));
-    let packing = reader.choice(panel, "packing", &packings, false);
+    let packing = panel.choice("packing", &packings, false);
     let bits = bits?;
     let fitting: Vec<Packing> =
         Packing::ALL.into_iter().filter(|packing| usize::from(packing.bit_depth()) == bits.value).collect();
     let names = fitting.iter().map(|packing| format!("\"{}\"", packing.name())).collect::<Vec<_>>().join(" or ");
     let Some(&first) = fitting.first() else {
-        let advice = "holod sends levels of 8, 10 or 16 bits".into();
-        reader.fault_in(panel, "bit_depth", bits.line, &bits.value.to_string(), "8, 10 or 16", advice);
+        let advice = "holod sends levels of 8, 10 or 16 bits";
+        bits.fault(bits.value, "8, 10 or 16", advice);
         return None;
     };
     let bit_depth = first.bit_depth();
-    let line = packing.and_then(|packing| packing.line);
+    let line = packing.as_ref().and_then(|packing| packing.line);
     let packing = match packing {
         Some(packing) if packing.value.bit_depth() == bit_depth => packing.value,
         Some(packing) => {
             let found = format!("\"{}\", which carries {} bits", packing.value.name(), packing.value.bit_depth());
             let expected = format!("{names}, as bit_depth is {bit_depth}");
-            let advice = "correct packing or bit_depth: the panel's manual says which bits it reads".into();
-            reader.fault_in(panel, "packing", line.or(bits.line), &found, &expected, advice);
+            let advice = "correct packing or bit_depth: the panel's manual says which bits it reads";
+            panel.fault_at("packing", line.or(bits.line), &found, &expected, advice);
             return None;
         }
         None if bit_depth == Packing::Gray.bit_depth() => Packing::Gray,
@@ -53,8 +50,8 @@ pub(super) fn read_levels<'a>(
         None if panel.has("packing") => return None,
         None => {
             let expected = format!("{names}, as bit_depth is {bit_depth}");
-            let advice = "add packing to [panel]: the panel's manual says which bits it reads".into();
-            reader.fault_in(panel, "packing", bits.line, "nothing", &expected, advice);
+            let advice = "add packing to [panel]: the panel's manual says which bits it reads";
+            panel.fault_at("packing", bits.line, "nothing", &expected, advice);
             return None;
         }
     };
@@ -62,7 +59,7 @@ pub(super) fn read_levels<'a>(
         let found = format!("\"{}\" in mode \"{}\"", packing.name(), PanelMode::ChannelPacked.name());
         let advice = format!("write mode = \"{}\", or 8 bits with \"gray\"", PanelMode::FieldSequential.name());
         let expected = "\"gray\" or \"gray10\", as red, green and blue each carry a field of their own";
-        reader.fault_in(panel, "packing", line.or(bits.line), &found, expected, advice);
+        panel.fault_at("packing", line.or(bits.line), &found, expected, advice);
         return None;
     }
     Some((bit_depth, packing))
@@ -78,64 +75,62 @@ pub(super) struct Phase {
     pub(super) flatness_rad: PerColour<Option<Vec<f32>>>,
 }
 
-pub(super) fn read_phase<'a>(
-    reader: &Reader<'a>,
-    panel: Section<'a>,
+pub(super) fn read_phase(
+    panel: &Section<'_>,
     levels: Option<(u8, Packing)>,
     resolution: Option<Resolution>,
     folder: &Path,
     provenance: &mut Provenance,
 ) -> Option<Phase> {
     let signs = [("positive", PhaseSign::Positive), ("negative", PhaseSign::Negative)];
-    let sign = reader.choice(panel, "phase_sign", &signs, true);
-    let lut_paths = reader.texts(panel, "lut_file", "a CSV file's path");
-    let needs_stroke = PerColour(lut_paths.0.map(|path| path.is_none()));
-    let stroke_pi = reader.numbers(panel, "stroke_pi", STROKE, needs_stroke);
+    let sign = panel.choice("phase_sign", &signs, true);
+    let lut_paths = panel.texts("lut_file", "a CSV file's path");
+    let needs_stroke = PerColour(lut_paths.0.each_ref().map(Option::is_none));
+    let stroke_pi = panel.numbers("stroke_pi", STROKE, needs_stroke);
     let orientations = Orientation::ALL.map(|orientation| (orientation.name(), orientation));
-    let orientation = reader.choice(panel, "orientation", &orientations, false);
+    let orientation = panel.choice("orientation", &orientations, false);
     let ways = OutOfStroke::ALL.map(|way| (way.name(), way));
-    let out_of_stroke = reader.choice(panel, "out_of_stroke", &ways, false);
-    let flatness_paths = reader.texts(panel, "flatness_file", "a PNG or BMP file's path");
-    let grays_of_2pi = reader.numbers(panel, "flatness_2pi_gray", GRAY_OF_2PI, PerColour([false; 3]));
-    let subtracted = read_flatness_sign(reader, panel);
+    let out_of_stroke = panel.choice("out_of_stroke", &ways, false);
+    let flatness_paths = panel.texts("flatness_file", "a PNG or BMP file's path");
+    let grays_of_2pi = panel.numbers("flatness_2pi_gray", GRAY_OF_2PI, PerColour([false; 3]));
+    let subtracted = read_flatness_sign(panel);
 
     let mut lut = PerColour([const { None }; 3]);
     let mut flatness_rad = PerColour([const { None }; 3]);
-    let mut stroke_rad = stroke_pi.map(|stroke| stroke.map(|stroke| stroke.value * PI));
+    let mut stroke_rad =
+        PerColour(stroke_pi.0.each_ref().map(|stroke| stroke.as_ref().map(|stroke| stroke.value * PI)));
     for colour in Colour::ALL {
-        if let (Some(path), Some((bit_depth, _))) = (lut_paths[colour], levels) {
-            let key = format!("lut_file.{colour}");
+        if let (Some(path), Some((bit_depth, _))) = (&lut_paths[colour], levels) {
             let file = folder.join(path.value);
             let read = read_bytes(&file, "text", TEXT_BYTES_MAX).and_then(|bytes| {
                 let xxh3 = XxHash3_64::oneshot(&bytes);
                 Ok((lut::read(&file, &text_of(bytes, &file)?, bit_depth)?, xxh3))
             });
-            let read = reader.of_file(panel, &key, path.line, read);
+            let read = path.of_file(read);
             let (table, xxh3) = read.unzip();
             lut[colour] = table;
             if let Some(table) = &lut[colour] {
                 let range = table_range(table);
-                check_lut(reader, panel, &key, path.line, range, sign.map(|sign| sign.value), stroke_pi[colour]);
+                check_lut(path, range, sign.as_ref().map(|sign| sign.value), stroke_pi[colour].as_ref());
                 stroke_rad[colour] = Some(range.either().abs());
             }
             provenance.lut_files[colour] = xxh3.map(|xxh3| TableFile { path: file, xxh3 });
         }
-        if let (Some(path), Some(resolution)) = (flatness_paths[colour], resolution) {
+        if let (Some(path), Some(resolution)) = (&flatness_paths[colour], resolution) {
             let file = folder.join(path.value);
-            let gray_of_2pi = grays_of_2pi[colour].map(|gray| gray.value);
+            let gray_of_2pi = grays_of_2pi[colour].as_ref().map(|gray| gray.value);
             let read = read_bytes(&file, "picture", PICTURE_BYTES_MAX).and_then(|bytes| {
                 let scale = GrayScale { gray_of_2pi, subtracted };
                 Ok((flatness::read(&file, &bytes, resolution, scale)?, XxHash3_64::oneshot(&bytes)))
             });
-            let read = reader.of_file(panel, &format!("flatness_file.{colour}"), path.line, read);
+            let read = path.of_file(read);
             let (picture, xxh3) = read.unzip();
             flatness_rad[colour] = picture;
             provenance.flatness_files[colour] = xxh3.map(|xxh3| TableFile { path: file, xxh3 });
         }
-        if let (None, Some(gray)) = (flatness_paths[colour], grays_of_2pi[colour]) {
+        if let (None, Some(gray)) = (&flatness_paths[colour], &grays_of_2pi[colour]) {
             let advice = format!("name {colour}'s picture in flatness_file, or take this out");
-            let key = format!("flatness_2pi_gray.{colour}");
-            reader.fault_in(panel, &key, gray.line, "a gray of no picture", "a flatness_file for it", advice);
+            gray.fault("a gray of no picture", "a flatness_file for it", advice);
         }
     }
     let stroke_rad = PerColour([stroke_rad.0[0]?, stroke_rad.0[1]?, stroke_rad.0[2]?]);
@@ -145,12 +140,12 @@ pub(super) fn read_phase<'a>(
 }
 
 /// Whether the flatness pictures show what is to be taken off.
-fn read_flatness_sign<'a>(reader: &Reader<'a>, panel: Section<'a>) -> bool {
+fn read_flatness_sign(panel: &Section<'_>) -> bool {
     let signs = [("add", false), ("subtract", true)];
-    let sign = reader.choice(panel, "flatness_sign", &signs, false);
-    if let Some(sign) = sign.filter(|_| !panel.has("flatness_file")) {
-        let advice = "name the pictures in flatness_file, or take this out".into();
-        reader.fault_in(panel, "flatness_sign", sign.line, "a sign of no picture", "a flatness_file for it", advice);
+    let sign = panel.choice("flatness_sign", &signs, false);
+    if let Some(sign) = sign.as_ref().filter(|_| !panel.has("flatness_file")) {
+        let advice = "name the pictures in flatness_file, or take this out";
+        sign.fault("a sign of no picture", "a flatness_file for it", advice);
     }
     sign.is_some_and(|sign| sign.value)
 }
@@ -181,27 +176,12 @@ fn table_range(table: &[LevelPhase]) -> TableRange {
 }
 
 /// Judges a measured table against what the rig file says in words.
-fn check_lut<'a>(
-    reader: &Reader<'a>,
-    panel: Section<'a>,
-    key: &str,
-    line: Option<usize>,
-    range: TableRange,
-    sign: Option<PhaseSign>,
-    stroke_pi: Option<Found<f64>>,
-) {
+fn check_lut(path: &Found<'_, &str>, range: TableRange, sign: Option<PhaseSign>, stroke_pi: Option<&Found<'_, f64>>) {
     let range_pi = range.either() / PI;
     if range_pi.abs() < STROKE.min || range_pi.abs() > STROKE.max {
         let expected = format!("a range of {} to {} π", STROKE.min, STROKE.max);
         let found = format!("a table whose phase changes by {} π", shown(range_pi));
-        reader.fault_in(
-            panel,
-            key,
-            line,
-            &found,
-            &expected,
-            "give its phases in radians: multiply turns by 2π, multiples of π by π".into(),
-        );
+        path.fault(&found, &expected, "give its phases in radians: multiply turns by 2π, multiples of π by π");
         return;
     }
     let found = format!("a table whose phase goes by {} π from the lowest level to the highest", shown(range_pi));
@@ -215,7 +195,7 @@ fn check_lut<'a>(
             Some((unit, unit_rad)) => format!("its phases look like {unit}: multiply them by {unit_rad:.5}"),
             None => "take stroke_pi out: the table says it".into(),
         };
-        reader.fault_in(panel, key, line, &found, &expected, advice);
+        path.fault(&found, &expected, advice);
     }
     let TableRange::Signed(range_rad) = range else { return };
     let (expected, other) = match sign {
@@ -224,5 +204,5 @@ fn check_lut<'a>(
         _ => return,
     };
     let advice = format!("write phase_sign = \"{other}\", or turn the table round");
-    reader.fault_in(panel, key, line, &found, expected, advice);
+    path.fault(found, expected, advice);
 }

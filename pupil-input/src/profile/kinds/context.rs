@@ -2,8 +2,9 @@
 
 use std::cell::Cell;
 
+use holod_calibration::toml_reader::Found;
+
 use crate::SampleEye;
-use crate::profile::reader::Found;
 use crate::size_unit::SizeUnit;
 use crate::wire::field::SizeRule;
 
@@ -20,18 +21,18 @@ pub(super) const PUPILS: [(&str, Option<SampleEye>); 4] = {
 };
 
 /// What the rest of the profile says about the figures on the wire.
-pub(in crate::profile) struct Context {
-    pub(in crate::profile) eye: Option<Found<SampleEye>>,
-    pub(in crate::profile) rate_hz: Option<Found<f64>>,
+pub(in crate::profile) struct Context<'a> {
+    pub(in crate::profile) eye: Option<Found<'a, SampleEye>>,
+    pub(in crate::profile) rate_hz: Option<Found<'a, f64>>,
     /// A frame counter is made a time by it.
     pub(in crate::profile) counts_frames: Cell<bool>,
     pub(in crate::profile) size: SizeRule,
     pub(in crate::profile) unit: SizeUnit,
     /// Where `[size]` is.
-    pub(in crate::profile) size_at: Option<Found<()>>,
+    pub(in crate::profile) size_at: Option<Found<'a, ()>>,
 }
 
-impl Context {
+impl Context<'_> {
     /// Frames a second, for what counts them.
     pub(super) fn frames_per_second(&self) -> Option<f64> {
         self.counts_frames.set(true);

@@ -2,16 +2,15 @@
 
 use std::cell::RefCell;
 
+use holod_calibration::toml_reader::{Found, Section};
 use toml_edit::Item;
 
 use super::layout::Places;
-use crate::profile::reader::{Found, Reader, Section};
 use crate::wire::field::{Field, NumberType};
 use crate::wire::packet::MAX_PACKET_BYTES;
 
 /// The places of a binary message, with what has been found to stand where.
-pub(super) struct FieldPlaces<'r, 'a> {
-    pub(super) reader: &'r Reader<'a>,
+pub(super) struct FieldPlaces {
     pub(super) big_endian: bool,
     /// Bytes that every message has.
     pub(super) least: usize,
@@ -28,16 +27,15 @@ pub(super) struct Taken {
     what: String,
 }
 
-impl FieldPlaces<'_, '_> {
+impl FieldPlaces {
     /// Takes the bytes from `at` for `what`; a fault where they lie outside the message or are taken already. Two
     /// fields may be the same number, of which each has its bits.
-    pub(super) fn take(&self, found: &Found<impl Sized>, at: i32, bytes: usize, field: Option<&Field>) {
-        let reader = self.reader;
+    pub(super) fn take(&self, found: &Found<'_, impl Sized>, at: i32, bytes: usize, field: Option<&Field>) {
         let from = if at < 0 { self.least as i64 + i64::from(at) } else { i64::from(at) };
         let to = from + bytes as i64;
         if from < 0 || to > self.least as i64 {
             let expected = format!("all of its {bytes} bytes within the {} of a message", self.least);
-            reader.fault(found, format!("byte {at}"), &expected, "correct the place, the type or the length");
+            found.fault(format!("byte {at}"), &expected, "correct the place, the type or the length");
             return;
         }
         let (from, to) = (from as usize, to as usize);
@@ -49,7 +47,7 @@ impl FieldPlaces<'_, '_> {
         };
         if let Some(other) = taken.iter().find(|other| other.from < to && from < other.to && !same_number(other)) {
             let there = format!("bytes {from} to {}, which {} has", to - 1, other.what);
-            reader.fault(found, there, "bytes of its own", "correct the place or the type of one of them");
+            found.fault(there, "bytes of its own", "correct the place or the type of one of them");
         }
         taken.push(Taken { from, to, field: field.cloned(), what: found.key.clone() });
     }
@@ -66,23 +64,22 @@ impl FieldPlaces<'_, '_> {
             ("f32", NumberType::F32),
             ("f64", NumberType::F64),
         ];
-        let reader = table.reader();
         let found = table.require("at", "the field's first byte, from 0; negative from the message's end");
         let most = MAX_PACKET_BYTES as i64;
-        let at = found.as_ref().and_then(|found| reader.integer(found, -most..=most));
+        let at = found.as_ref().and_then(|found| found.integer(-most..=most));
         let kind = table.require("type", "the field's type, such as \"u16\"");
-        let kind = kind.and_then(|kind| reader.choose(&kind, &TYPES));
+        let kind = kind.and_then(|kind| kind.choose(&TYPES));
         let big_endian = read_endian(table).unwrap_or(self.big_endian);
         let shift = table.get("shift");
         let mask = table.get("mask");
         let (found, at, kind) = (found?, at? as i32, kind?);
         let bits = kind.bytes() as i64 * 8;
         for item in [&shift, &mask].into_iter().flatten().filter(|_| kind.is_float()) {
-            reader.fault(item, "bits of a number with a fraction", "a whole number's type", "take it out");
+            item.fault("bits of a number with a fraction", "a whole number's type", "take it out");
         }
-        let shift = shift.and_then(|shift| reader.integer(&shift, 0..=bits - 1)).unwrap_or(0) as u32;
+        let shift = shift.and_then(|shift| shift.integer(0..=bits - 1)).unwrap_or(0) as u32;
         let widest = if bits < 63 { (1 << bits) - 1 } else { i64::MAX };
-        let mask = mask.and_then(|mask| reader.integer(&mask, 1..=widest)).map(|mask| mask as u64);
+        let mask = mask.and_then(|mask| mask.integer(1..=widest)).map(|mask| mask as u64);
         let field = Field { at, kind, big_endian, shift, mask };
         self.take(&found, at, kind.bytes(), Some(&field));
         Some(field)
@@ -90,13 +87,13 @@ impl FieldPlaces<'_, '_> {
 }
 
 pub(super) fn read_endian(table: &Section<'_>) -> Option<bool> {
-    table.choice("endian", &[("little", false), ("big", true)])
+    Some(table.choice("endian", &[("little", false), ("big", true)], false)?.value)
 }
 
-impl<'a> Places<'a> for FieldPlaces<'_, 'a> {
+impl<'a> Places<'a> for FieldPlaces {
     type Place = Field;
 
-    fn bare(&self, _: &Found<&'a Item>) -> Option<Option<Field>> {
+    fn bare(&self, _: &Found<'a, &'a Item>) -> Option<Option<Field>> {
         None
     }
 

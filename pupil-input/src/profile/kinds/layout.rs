@@ -1,10 +1,10 @@
 //! Where a message holds its time, its eye and its pupils, whatever its places are: columns, bytes or usages.
 
+use holod_calibration::toml_reader::{Found, Section};
 use toml_edit::Item;
 
 use super::context::{Context, EYES, PUPILS};
 use crate::SampleEye;
-use crate::profile::reader::{Found, Reader, Section};
 use crate::wire::field::{Figure, Layout, Literal, PupilAt, TimeAt, Validity};
 
 /// How the places of a kind of message are written.
@@ -12,7 +12,7 @@ pub(super) trait Places<'a> {
     type Place: Clone;
 
     /// The place that an item is in itself; None where it is a table that tells it.
-    fn bare(&self, found: &Found<&'a Item>) -> Option<Option<Self::Place>>;
+    fn bare(&self, found: &Found<'a, &'a Item>) -> Option<Option<Self::Place>>;
 
     /// The place that the keys of a table tell.
     fn read(&self, table: &Section<'a>) -> Option<Self::Place>;
@@ -34,11 +34,10 @@ fn read_item<'a, P: Places<'a>, T>(
     more: impl FnOnce(&Section<'a>, P::Place) -> Option<T>,
 ) -> Option<T> {
     let found = section.get(key)?;
-    let reader = section.reader();
     if let Some(place) = places.bare(&found) {
-        return more(&reader.empty(&found), place?);
+        return more(&Section::empty(&found), place?);
     }
-    let table = reader.table(&found);
+    let table = found.table();
     if !table.is_there() {
         return None;
     }
@@ -62,7 +61,7 @@ fn read_figure<'a, P: Places<'a>>(places: &P, section: &Section<'a>, key: &'stat
 pub(super) fn read_layout<'a, P: Places<'a>>(
     places: &P,
     wire: &Section<'a>,
-    context: &Context,
+    context: &Context<'_>,
 ) -> Option<Layout<P::Place>> {
     let wrap = |table: &Section<'a>, at: &P::Place| {
         table.integer("wrap_bits", 1..=62).map(|bits| bits as u32).or_else(|| places.wrap_bits(at))
@@ -113,13 +112,13 @@ pub(super) fn read_layout<'a, P: Places<'a>>(
         wire.fault("no pupil", expected, "add for example [wire.left] with the place of its size");
     }
     if let Some(found) = context.eye.as_ref().filter(|_| !wire.has("pupil") || wire.has("eye")) {
-        wire.reader().fault(found, found.value, "no eye here: the wire tells it", "take it out");
+        found.fault(found.value, "no eye here: the wire tells it", "take it out");
     }
     Some(Layout { time, sequence, eye, pupils, size: context.size })
 }
 
 /// Nanoseconds of one unit of a time.
-fn read_tick(table: &Section<'_>, context: &Context) -> Option<f64> {
+fn read_tick(table: &Section<'_>, context: &Context<'_>) -> Option<f64> {
     const UNITS: [(&str, Option<f64>); 5] =
         [("s", Some(1e9)), ("ms", Some(1e6)), ("us", Some(1e3)), ("ns", Some(1.0)), ("frames", None)];
     if let Some(tick_ns) = table.positive("tick_ns") {
@@ -129,13 +128,12 @@ fn read_tick(table: &Section<'_>, context: &Context) -> Option<f64> {
         return Some(tick_ns);
     }
     let unit = table.require("unit", "the time's unit, or tick_ns")?;
-    if let Some(ns) = table.reader().choose(&unit, &UNITS)? {
+    if let Some(ns) = unit.choose(&UNITS)? {
         return Some(ns);
     }
     let frames_per_second = context.frames_per_second();
     if frames_per_second.is_none() {
-        table.reader().fault(
-            &unit,
+        unit.fault(
             "\"frames\" and no rate_hz",
             "how many frames a second has",
             "add rate_hz = 60.0 to the top of the file",
@@ -153,7 +151,7 @@ fn read_pupil<'a, P: Places<'a>>(places: &P, table: &Section<'a>, eye: Option<Sa
     let valid = read_item(places, table, "valid", |table, at| {
         let mut rules = Vec::new();
         for key in ["equals", "differs"] {
-            if let Some(literal) = table.get(key).and_then(|found| read_literal(places, table.reader(), &found)) {
+            if let Some(literal) = table.get(key).and_then(|found| read_literal(places, &found)) {
                 rules.push(if key == "equals" { Validity::Equals(literal) } else { Validity::Differs(literal) });
             }
         }
@@ -177,22 +175,21 @@ fn read_pupil<'a, P: Places<'a>>(places: &P, table: &Section<'a>, eye: Option<Sa
 /// One literal, or an array of them.
 fn read_literals<'a, P: Places<'a>>(places: &P, table: &Section<'a>, key: &'static str) -> Vec<Literal> {
     let Some(found) = table.get(key) else { return Vec::new() };
-    let reader = table.reader();
     if found.value.is_array() {
-        let items = reader.items(&found, "figures in brackets");
-        items.iter().filter_map(|item| read_literal(places, reader, &item.with(&item.value))).collect()
+        let items = found.items("figures in brackets");
+        items.iter().filter_map(|item| read_literal(places, &item.with(&item.value))).collect()
     } else {
-        read_literal(places, reader, &found).into_iter().collect()
+        read_literal(places, &found).into_iter().collect()
     }
 }
 
-fn read_literal<'a, P: Places<'a>>(places: &P, reader: &Reader<'_>, found: &Found<&Item>) -> Option<Literal> {
+fn read_literal<'a, P: Places<'a>>(places: &P, found: &Found<'_, &Item>) -> Option<Literal> {
     match found.value.as_str() {
         Some(text) if places.texts() => Some(Literal::Text(text.as_bytes().to_vec())),
         Some(text) => {
-            reader.fault(found, format!("{text:?}"), "a number: this wire has no texts", "take the quotes away");
+            found.fault(format!("{text:?}"), "a number: this wire has no texts", "take the quotes away");
             None
         }
-        None => reader.number(found, "a number or a text").map(Literal::Number),
+        None => found.number("a number or a text").map(Literal::Number),
     }
 }

@@ -19,7 +19,8 @@ use report::read_report;
 use usages::read_usages;
 use vendor::{read_iscan, read_livetrack, read_open_gaze, read_pupilext};
 
-use super::reader::Section;
+use holod_calibration::toml_reader::Section;
+
 use crate::size_unit::SizeUnit;
 use crate::wire::Format;
 
@@ -32,7 +33,7 @@ struct Kind {
 }
 
 /// The format that the keys of `[wire]` describe, and what its sizes are before the rig's scale.
-type ReadKind = for<'a> fn(&Section<'a>, &Context) -> Option<(Format, SizeUnit)>;
+type ReadKind = for<'a> fn(&Section<'a>, &Context<'_>) -> Option<(Format, SizeUnit)>;
 
 static KINDS: [Kind; 11] = [
     known("holod", |_, _| Some((Format::Lines, SizeUnit::Millimetres))),
@@ -57,16 +58,13 @@ const fn known(name: &'static str, read: ReadKind) -> Kind {
 }
 
 /// The format, and what its sizes are before the rig's scale.
-pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context) -> Option<(Format, SizeUnit)> {
-    let names = KINDS.each_ref().map(|kind| kind.name);
-    let expected = format!("one of \"{}\"", names.join("\", \""));
-    let found = wire.require("kind", &expected)?;
+pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context<'_>) -> Option<(Format, SizeUnit)> {
     let kinds = KINDS.each_ref().map(|kind| (kind.name, kind));
-    let kind = wire.reader().choose(&found, &kinds)?;
+    let kind = wire.choice("kind", &kinds, true)?.value;
     let read = (kind.read)(wire, context);
     if let Some(size) = context.size_at.as_ref().filter(|_| !kind.takes_size) {
         let advice = "take it out; the rig's tracker.scale_mm_per_unit is for sizes that are no millimetres";
-        wire.reader().fault(size, "a table", &format!("none for \"{}\": its sizes are known", kind.name), advice);
+        size.fault("a table", &format!("none for \"{}\": its sizes are known", kind.name), advice);
     }
     // Where it is none, keys may not have been asked for.
     if read.is_some() {

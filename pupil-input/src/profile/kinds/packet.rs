@@ -2,40 +2,41 @@
 
 use std::cell::RefCell;
 
+use holod_calibration::toml_reader::Section;
+
 use super::checksum::read_checksum_kind;
 use super::context::Context;
 use super::fields::{FieldPlaces, read_endian};
 use super::layout::read_layout;
-use crate::profile::reader::Section;
+use crate::profile::bytes::read_bytes;
 use crate::wire::packet::{MAX_PACKET_BYTES, PacketChecksum, PacketLength, PacketSettings};
 
 /// Bytes of the longest sync word.
 const SYNC_MAX: usize = 16;
 
-pub(super) fn read_packet<'a>(wire: &Section<'a>, context: &Context) -> Option<PacketSettings> {
+pub(super) fn read_packet<'a>(wire: &Section<'a>, context: &Context<'_>) -> Option<PacketSettings> {
     const SYNC: &str = "the bytes that begin a packet, 1 to 16";
-    let reader = wire.reader();
     let big_endian = read_endian(wire).unwrap_or(false);
     let sync_found = wire.require("sync", SYNC)?;
-    let sync = reader.bytes(&sync_found)?;
+    let sync = read_bytes(&sync_found)?;
     if sync.is_empty() || sync.len() > SYNC_MAX {
-        reader.fault(&sync_found, format!("{} bytes", sync.len()), SYNC, "correct it");
+        sync_found.fault(format!("{} bytes", sync.len()), SYNC, "correct it");
         return None;
     }
     let found = wire.require("length", "the packet's bytes, or the table of the field that tells them")?;
     let longest = MAX_PACKET_BYTES as i64;
     let shortest = sync.len() as i64 + 1;
     let (least, told) = if found.value.as_table_like().is_some() {
-        let table = reader.table(&found);
+        let table = found.table();
         let [least, most] = ["least", "most"].map(|key| {
             let bound = table.require(key, "bytes of a whole packet");
-            bound.and_then(|bound| reader.integer(&bound, shortest..=longest))
+            bound.and_then(|bound| bound.integer(shortest..=longest))
         });
         (least? as usize, Some((table, most?)))
     } else {
-        (reader.integer(&found, shortest..=longest)? as usize, None)
+        (found.integer(shortest..=longest)? as usize, None)
     };
-    let places = FieldPlaces { reader, big_endian, least, taken: RefCell::default() };
+    let places = FieldPlaces { big_endian, least, taken: RefCell::default() };
     places.take(&sync_found, 0, sync.len(), None);
     let length = match told {
         None => Some(PacketLength::Fixed(least)),
@@ -65,15 +66,14 @@ pub(super) fn read_packet<'a>(wire: &Section<'a>, context: &Context) -> Option<P
     Some(PacketSettings { sync, length: length?, checksum, layout: layout? })
 }
 
-fn read_packet_checksum(wire: &Section<'_>, places: &FieldPlaces<'_, '_>) -> Option<PacketChecksum> {
-    let reader = wire.reader();
-    let table = reader.table(&wire.get("checksum")?);
+fn read_packet_checksum(wire: &Section<'_>, places: &FieldPlaces) -> Option<PacketChecksum> {
+    let table = wire.get("checksum")?.table();
     let kind = table.require("kind", "a kind of checksum").and_then(|kind| read_checksum_kind(&table, &kind));
     let big_endian = read_endian(&table).unwrap_or(places.big_endian);
     let bound = |key| {
         let found = table.get(key)?;
         let range = -(places.least as i64)..=places.least as i64;
-        reader.integer(&found, range).map(|at| at as i32)
+        found.integer(range).map(|at| at as i32)
     };
     let (at, from, to) = (bound("at"), bound("from"), bound("to"));
     let (Some(at), Some(kind)) = (at, kind) else {

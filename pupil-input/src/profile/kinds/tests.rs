@@ -33,6 +33,7 @@ fn each_mistake_is_told_with_its_line_and_key() {
             "line 1, format: found \"holod-tracker-2\"; expected one of \"holod-tracker-1\"",
         ),
         ("", "format = \"holod-tracker-1\"\n[wire]\nkind = \"holod\"", "name: found nothing"),
+        ("", "name = \"\"", "line 1, name: found an empty text"),
         ("", "wires = 1", "line 1, wires: found an unknown key"),
         ("", "wires = 1", "did you mean `wire`?"),
         ("", "eye = \"middle\"", "line 1, eye: found \"middle\"; expected one of \"left\", \"right\", \"both\""),
@@ -66,7 +67,7 @@ fn each_mistake_is_told_with_its_line_and_key() {
             "[size]\nunit = \"inch\"",
             "line 2, size.unit: found \"inch\"; expected one of \"mm\", \"pixels\", \"arbitrary\"",
         ),
-        ("", "[size]\nkind = \"diametre\"", "did you mean `diameter`?"),
+        ("", "[size]\nkind = \"diametre\"", "did you mean \"diameter\"?"),
         ("", "[size]\nmm_per_unit = -1", "line 2, size.mm_per_unit: found -1"),
         (
             LINES,
@@ -80,7 +81,7 @@ fn each_mistake_is_told_with_its_line_and_key() {
             "[wire]\nkind = \"packets\"",
             "line 2, wire.kind: found \"packets\"; expected one of \"holod\", \"delimited\"",
         ),
-        ("", "[wire]\nkind = \"packets\"", "did you mean `packet`?"),
+        ("", "[wire]\nkind = \"packets\"", "did you mean \"packet\"?"),
         ("", "[wire]\nkind = \"holod\"\nsync = 1", "line 3, wire.sync: found an unknown key"),
         // Lines.
         (LINES, "", "line 3, wire: found no pupil"),
@@ -237,6 +238,13 @@ fn each_mistake_is_told_with_its_line_and_key() {
     let eye = "eye = \"left\"
 ";
     assert!(faults(eye, &format!("{LINES}{size}")).contains("line 1, eye: found left; expected no eye here"));
+}
+
+#[test]
+fn a_table_that_is_none_is_one_fault_not_one_for_each_of_its_keys() {
+    let told = faults(PACKET, "sync = [1, 2]\nlength = 8\nleft = { size = { at = 2, type = \"u8\" } }\nchecksum = 3");
+    assert_eq!(told.lines().count(), 1, "{told}");
+    assert!(told.starts_with("line 8, wire.checksum: found an integer 3; expected a table"), "{told}");
 }
 
 #[test]

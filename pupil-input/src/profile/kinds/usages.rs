@@ -1,39 +1,37 @@
 //! `kind = "usages"`: HID reports whose fields the device describes.
 
+use holod_calibration::toml_reader::{Found, Section};
 use toml_edit::Item;
 
 use super::context::Context;
 use super::layout::{Places, read_layout};
-use crate::profile::reader::{Found, Reader, Section};
 use crate::wire::hid_descriptor::Usage;
 use crate::wire::usages::{UsageAt, UsageSettings};
 
-pub(super) fn read_usages<'a>(wire: &Section<'a>, context: &Context) -> Option<UsageSettings> {
-    let layout = read_layout(&UsagePlaces { reader: wire.reader() }, wire, context)?;
+pub(super) fn read_usages<'a>(wire: &Section<'a>, context: &Context<'_>) -> Option<UsageSettings> {
+    let layout = read_layout(&UsagePlaces, wire, context)?;
     Some(UsageSettings { layout })
 }
 
 /// The fields of a HID report, by their usages.
-struct UsagePlaces<'r, 'a> {
-    reader: &'r Reader<'a>,
-}
+struct UsagePlaces;
 
-impl UsagePlaces<'_, '_> {
-    fn usage(&self, found: &Found<&Item>) -> Option<Usage> {
+impl UsagePlaces {
+    fn usage(&self, found: &Found<'_, &Item>) -> Option<Usage> {
         const EXPECTED: &str = "a page and a number in hexadecimals, such as \"ff00:0030\"";
-        let text = self.reader.text(found, EXPECTED)?;
+        let text = found.text(EXPECTED)?;
         let usage = text.parse().ok();
         if usage.is_none() {
-            self.reader.fault(found, format!("{text:?}"), EXPECTED, "correct it");
+            found.fault(format!("{text:?}"), EXPECTED, "correct it");
         }
         usage
     }
 }
 
-impl<'a> Places<'a> for UsagePlaces<'_, 'a> {
+impl<'a> Places<'a> for UsagePlaces {
     type Place = UsageAt;
 
-    fn bare(&self, found: &Found<&'a Item>) -> Option<Option<UsageAt>> {
+    fn bare(&self, found: &Found<'a, &'a Item>) -> Option<Option<UsageAt>> {
         let bare = || self.usage(found).map(|usage| UsageAt { usage, collection: None });
         found.value.as_table_like().is_none().then(bare)
     }

@@ -1,8 +1,9 @@
 //! The `[wire]` of trackers whose formats are their makers'.
 
+use holod_calibration::toml_reader::{Found, Section};
+
 use super::context::{Context, PUPILS};
 use crate::SampleEye;
-use crate::profile::reader::{Found, Section};
 use crate::size_unit::SizeUnit;
 use crate::wire::Format;
 use crate::wire::field::SizeKind;
@@ -18,11 +19,10 @@ const ISCAN_SCALE: f64 = 0.1;
 /// Columns of the longest LiveTrack row.
 const LIVETRACK_COLUMNS_MAX: i64 = 32;
 
-pub(super) fn read_iscan(wire: &Section<'_>, context: &Context) -> Option<IscanSettings> {
-    let reader = wire.reader();
+pub(super) fn read_iscan(wire: &Section<'_>, context: &Context<'_>) -> Option<IscanSettings> {
     let words = wire.require("words", "how many words a packet has: the outputs ticked on the tracker");
-    let words = words.and_then(|words| reader.integer(&words, 1..=ISCAN_WORDS_MAX))?;
-    let zero_is_lost = !wire.has("zero_is_lost") || wire.flag("zero_is_lost");
+    let words = words.and_then(|words| words.integer(1..=ISCAN_WORDS_MAX))?;
+    let zero_is_lost = wire.flag("zero_is_lost", true);
     let diameters = match context.size.kind {
         SizeKind::Diameter => 1.0,
         SizeKind::Radius => 2.0,
@@ -38,7 +38,7 @@ pub(super) fn read_iscan(wire: &Section<'_>, context: &Context) -> Option<IscanS
             continue;
         }
         let word = table.require("word", "which word is the pupil's diameter, from 1");
-        let word = word.and_then(|word| reader.integer(&word, 1..=words));
+        let word = word.and_then(|word| word.integer(1..=words));
         let scale = table.positive("scale").unwrap_or(ISCAN_SCALE);
         table.finish();
         let eye = own_eye.or(context.eye.as_ref().map(|eye| eye.value));
@@ -62,9 +62,8 @@ pub(super) fn read_iscan(wire: &Section<'_>, context: &Context) -> Option<IscanS
     Some(IscanSettings { words: words as usize, pupils, zero_is_lost })
 }
 
-pub(super) fn read_livetrack(wire: &Section<'_>, context: &Context) -> Option<(Format, SizeUnit)> {
+pub(super) fn read_livetrack(wire: &Section<'_>, context: &Context<'_>) -> Option<(Format, SizeUnit)> {
     const EXPECTED: &str = "one of { area = 7 }, { diameter = 7 }, { axes = [7, 8] }, columns from 1, the label's";
-    let reader = wire.reader();
     let usual = LiveTrackSettings::default();
     let table = wire.section("size");
     let columns = 4..=LIVETRACK_COLUMNS_MAX;
@@ -73,11 +72,11 @@ pub(super) fn read_livetrack(wire: &Section<'_>, context: &Context) -> Option<(F
     sizes.extend(table.integer("area", columns.clone()).map(|column| LiveTrackSize::Area(place(column))));
     sizes.extend(table.integer("diameter", columns.clone()).map(|column| LiveTrackSize::Diameter(place(column))));
     if let Some(axes) = table.get("axes") {
-        let items = reader.items(&axes, EXPECTED);
-        let axis = |item: &Found<_>| reader.integer(&item.with(&item.value), columns.clone());
+        let items = axes.items(EXPECTED);
+        let axis = |item: &Found<'_, _>| item.with(&item.value).integer(columns.clone());
         match items.iter().map(axis).collect::<Option<Vec<_>>>().as_deref() {
             Some([width, height]) => sizes.push(LiveTrackSize::Axes(place(*width), place(*height))),
-            Some(other) => reader.fault(&axes, format!("{} columns", other.len()), EXPECTED, "name width and height"),
+            Some(other) => axes.fault(format!("{} columns", other.len()), EXPECTED, "name width and height"),
             None => {}
         }
     }
@@ -96,33 +95,32 @@ pub(super) fn read_livetrack(wire: &Section<'_>, context: &Context) -> Option<(F
     Some((Format::LiveTrack(settings), SizeUnit::Pixels))
 }
 
-pub(super) fn read_open_gaze(wire: &Section<'_>, context: &Context) -> (Format, SizeUnit) {
-    refuse_eye(wire, context);
+pub(super) fn read_open_gaze(wire: &Section<'_>, context: &Context<'_>) -> (Format, SizeUnit) {
+    refuse_eye(context);
     let sizes = [
         ("mm", (OpenGazeSize::Millimetres, SizeUnit::Millimetres)),
         ("pixels", (OpenGazeSize::Pixels, SizeUnit::Pixels)),
     ];
-    let (size, unit) = wire.choice("size", &sizes).unwrap_or(sizes[0].1);
+    let (size, unit) = wire.choice("size", &sizes, false).map_or(sizes[0].1, |size| size.value);
     let ticks_per_second = wire.positive("ticks_per_second");
     (Format::OpenGaze(OpenGazeSettings { size, ticks_per_second }), unit)
 }
 
-pub(super) fn read_pupilext(wire: &Section<'_>, context: &Context) -> (Format, SizeUnit) {
+pub(super) fn read_pupilext(wire: &Section<'_>, context: &Context<'_>) -> (Format, SizeUnit) {
     const DELIMITER: &str = "one character such as \",\"";
-    let reader = wire.reader();
-    let json = wire.choice("container", &[("csv", false), ("json", true)]).unwrap_or(false);
-    let delimiter = wire.get("delimiter").and_then(|found| match *reader.text(&found, DELIMITER)?.as_bytes() {
+    let json = wire.choice("container", &[("csv", false), ("json", true)], false).is_some_and(|json| json.value);
+    let delimiter = wire.get("delimiter").and_then(|found| match *found.raw_text(DELIMITER)?.as_bytes() {
         [byte] if byte.is_ascii() && !json => Some(byte),
         _ => {
-            reader.fault(&found, found.value.to_string().trim(), DELIMITER, "and only for container = \"csv\"");
+            found.fault(found.value.to_string().trim(), DELIMITER, "and only for container = \"csv\"");
             None
         }
     });
     let container =
         if json { PupilExtContainer::Json } else { PupilExtContainer::Csv { delimiter: delimiter.unwrap_or(b',') } };
-    let two = wire.choice("eyes", &[("one", false), ("two", true)]).unwrap_or(false);
+    let two = wire.choice("eyes", &[("one", false), ("two", true)], false).is_some_and(|two| two.value);
     let eyes = if two {
-        refuse_eye(wire, context);
+        refuse_eye(context);
         PupilExtEyes::Two
     } else {
         PupilExtEyes::One(context.eye.as_ref().map_or(SampleEye::Both, |eye| eye.value))
@@ -132,13 +130,13 @@ pub(super) fn read_pupilext(wire: &Section<'_>, context: &Context) -> (Format, S
         ("pixels", (PupilExtSize::Pixels, SizeUnit::Pixels)),
         ("undistorted-pixels", (PupilExtSize::UndistortedPixels, SizeUnit::Pixels)),
     ];
-    let (size, unit) = wire.choice("size", &sizes).unwrap_or(sizes[0].1);
-    (Format::PupilExt(PupilExtSettings { container, eyes, stereo: wire.flag("stereo"), size }), unit)
+    let (size, unit) = wire.choice("size", &sizes, false).map_or(sizes[0].1, |size| size.value);
+    (Format::PupilExt(PupilExtSettings { container, eyes, stereo: wire.flag("stereo", false), size }), unit)
 }
 
-fn refuse_eye(wire: &Section<'_>, context: &Context) {
+fn refuse_eye(context: &Context<'_>) {
     if let Some(found) = &context.eye {
-        wire.reader().fault(found, found.value, "no eye here: the wire tells it", "take it out");
+        found.fault(found.value, "no eye here: the wire tells it", "take it out");
     }
 }
 

@@ -1,11 +1,17 @@
-//! The text of a TOML file that describes a thing, such as a bench or a tracker, and all that is found wrong with it,
-//! so that one look at the messages is enough to mend the file.
+//! Reads the keys of a TOML file that describes a thing, such as a bench or a tracker, and collects all that is wrong
+//! with them, so that one look at the messages is enough to mend the file.
+
+mod found;
+mod section;
 
 use std::cell::RefCell;
 use std::fmt;
 use std::ops::Range;
 
 use toml_edit::{Document, Item, TableLike};
+
+pub use found::Found;
+pub use section::Section;
 
 /// How many syntax faults are looked for before a file is given up.
 const SYNTAX_FAULTS_MAX: usize = 16;
@@ -37,22 +43,32 @@ impl fmt::Display for Fault {
     }
 }
 
+/// Reads the file whose text is `text` with `make`, which gets the keys outside any table first.
+///
+/// # Errors
+/// Everything that is wrong with the file, in the order of its lines. Of a text that is no TOML, only that.
+pub fn read<T>(text: &str, make: impl for<'s> FnOnce(&Section<'s>) -> Option<T>) -> Result<T, Vec<Fault>> {
+    let reader = Reader::new(text);
+    let document = reader.document();
+    let made = document.as_ref().and_then(|document| make(&Section::root(&reader, document.as_table())));
+    reader.finish(made)
+}
+
 /// A file's text, and its faults so far.
 #[derive(Debug)]
-pub struct TomlSource<'a> {
+struct Reader<'a> {
     text: &'a str,
     faults: RefCell<Vec<Fault>>,
 }
 
-impl<'a> TomlSource<'a> {
-    /// Of a file with this text.
-    pub const fn new(text: &'a str) -> Self {
+impl<'a> Reader<'a> {
+    const fn new(text: &'a str) -> Self {
         Self { text, faults: RefCell::new(Vec::new()) }
     }
 
     /// The document, or nothing where it is not TOML; then every syntax fault is noted that shows up when the faulty
     /// lines before it are left out.
-    pub fn document(&self) -> Option<Document<String>> {
+    fn document(&self) -> Option<Document<String>> {
         let mut remaining = self.text.to_owned();
         for found_before in 0..SYNTAX_FAULTS_MAX {
             let error = match Document::parse(remaining.clone()) {
@@ -75,18 +91,18 @@ impl<'a> TomlSource<'a> {
     }
 
     /// The line, from 1, in which `span` begins.
-    pub fn line_of(&self, span: Option<Range<usize>>) -> Option<usize> {
+    fn line_of(&self, span: Option<Range<usize>>) -> Option<usize> {
         let bytes = self.text.as_bytes();
         span.map(|span| 1 + bytes[..span.start.min(bytes.len())].iter().filter(|&&b| b == b'\n').count())
     }
 
     /// The line of `key` in `table`, whose item it is.
-    pub fn line_of_key(&self, table: &dyn TableLike, key: &str, item: &Item) -> Option<usize> {
+    fn line_of_key(&self, table: &dyn TableLike, key: &str, item: &Item) -> Option<usize> {
         self.line_of(table.key(key).and_then(|key| key.span()).or_else(|| item.span()))
     }
 
     /// Notes a fault, its parts as [`Fault`] has them.
-    pub fn fault(
+    fn fault(
         &self,
         key: impl Into<String>,
         line: Option<usize>,
@@ -98,11 +114,8 @@ impl<'a> TomlSource<'a> {
         self.faults.borrow_mut().push(Fault { key: key.into(), line, found, expected, advice: advice.into() });
     }
 
-    /// What was read, where nothing is wrong.
-    ///
-    /// # Errors
-    /// Every fault, in the order of the file's lines.
-    pub fn finish<T>(self, read: Option<T>) -> Result<T, Vec<Fault>> {
+    /// What was read, where nothing is wrong; else every fault, in the order of the file's lines.
+    fn finish<T>(self, read: Option<T>) -> Result<T, Vec<Fault>> {
         let mut faults = self.faults.into_inner();
         match read {
             Some(read) if faults.is_empty() => Ok(read),
@@ -115,25 +128,25 @@ impl<'a> TomlSource<'a> {
 }
 
 /// What stands in the file, short enough for one line.
-pub fn describe(item: &Item) -> String {
+fn describe(item: &Item) -> String {
     const SHOWN_MAX: usize = 60;
     let text = item.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
     let shown: String = text.chars().take(SHOWN_MAX).collect();
     let more = if shown.len() < text.len() { "..." } else { "" };
     match item.type_name() {
-        kind @ ("array" | "integer") => format!("an {kind} {shown}{more}"),
+        kind @ ("array" | "inline table" | "integer") => format!("an {kind} {shown}{more}"),
         "table" | "array of tables" => "a table".into(),
         kind => format!("a {kind} {shown}{more}"),
     }
 }
 
 /// What is found where nobody asked for `item`.
-pub fn describe_unknown(item: &Item) -> &'static str {
+fn describe_unknown(item: &Item) -> &'static str {
     if item.is_table() { "an unknown table" } else { "an unknown key" }
 }
 
 /// The name among `names` that `given` was most likely meant to be.
-pub fn nearest<'n>(given: &str, names: &[&'n str]) -> Option<&'n str> {
+fn nearest<'n>(given: &str, names: &[&'n str]) -> Option<&'n str> {
     const ALIKE_MIN: f64 = 0.8;
     let alike = |name: &&&str| strsim::jaro_winkler(given, name);
     let best = names.iter().max_by(|a, b| alike(a).total_cmp(&alike(b)))?;
@@ -151,17 +164,17 @@ mod tests {
 
     #[test]
     fn every_faulty_line_is_told_in_its_order_and_a_sound_text_gives_its_document() {
-        let source = TomlSource::new("a = 1\nb = \nc = 2\n");
-        source.fault("c", Some(3), 2, "three", "correct it");
-        assert_eq!(source.document().map(drop), None);
-        let faults = source.finish(Some(())).unwrap_err();
+        let reader = Reader::new("a = 1\nb = \nc = 2\n");
+        reader.fault("c", Some(3), 2, "three", "correct it");
+        assert_eq!(reader.document().map(drop), None);
+        let faults = reader.finish(Some(())).unwrap_err();
         assert_eq!(faults.iter().map(|fault| fault.line).collect::<Vec<_>>(), [Some(2), Some(3)]);
         assert_eq!(faults[1].to_string(), "line 3, c: found 2; expected three; correct it");
 
-        let source = TomlSource::new("a = 1\n");
-        assert!(source.document().is_some_and(|document| document.contains_key("a")));
-        assert_eq!(source.finish(Some(7)), Ok(7));
-        assert_eq!(TomlSource::new("").finish::<()>(None), Err(Vec::new()));
+        let reader = Reader::new("a = 1\n");
+        assert!(reader.document().is_some_and(|document| document.contains_key("a")));
+        assert_eq!(reader.finish(Some(7)), Ok(7));
+        assert_eq!(Reader::new("").finish::<()>(None), Err(Vec::new()));
     }
 
     #[test]
