@@ -220,13 +220,7 @@ fn show(connector: &str, mode: &str, panel_mode: &str, options: &[&str]) -> Resu
     let target = DrmTarget { connector: connector.to_owned(), card: None };
     let t_begin = host_now();
     let mut presenter = DrmPanel::open(&target, &PanelSetup { panel, flat })?;
-    let checks: Vec<_> = presenter
-        .checks()
-        .iter()
-        .map(|check| json!([check.name, check.found, check.wanted, format!("{:?}", check.verdict).to_lowercase()]))
-        .collect();
-    let wrong = presenter.checks().iter().filter(|check| check.verdict == Verdict::Wrong).count();
-    tell(&json!({ "opened_ms": (host_now() - t_begin).0 / 1_000_000, "wrong": wrong, "checks": checks }));
+    tell_checks(&presenter, t_begin);
 
     raise_priority();
     let mut crcs = options.crc.as_deref().map(Crcs::open).transpose()?;
@@ -287,6 +281,16 @@ fn show(connector: &str, mode: &str, panel_mode: &str, options: &[&str]) -> Resu
         compare(&notes.refreshes, &crcs.seen, &patterns, options.wrong_level);
     }
     Ok(())
+}
+
+fn tell_checks(presenter: &DrmPanel, t_begin: TimeNs) {
+    let checks: Vec<_> = presenter
+        .checks()
+        .iter()
+        .map(|check| json!([check.name, check.found, check.wanted, format!("{:?}", check.verdict).to_lowercase()]))
+        .collect();
+    let wrong = presenter.checks().iter().filter(|check| check.verdict == Verdict::Wrong).count();
+    tell(&json!({ "opened_ms": (host_now() - t_begin).0 / 1_000_000, "wrong": wrong, "checks": checks }));
 }
 
 /// That of holod's own panel thread, where it may.

@@ -543,8 +543,27 @@ fn active_files(rig: &Rig) -> Vec<ActiveFile> {
 }
 
 fn notes(rig: &Rig) -> Vec<String> {
+    let mut notes = rig.warnings();
+    notes.extend(laser_notes(rig));
+    notes.extend(optics_notes(rig));
+    if let Some(profile) = rig.provenance.panel_profile.and_then(PanelProfile::named)
+        && !profile.unverified.is_empty()
+    {
+        notes.push(format!(
+            "panel profile {} ({}): no source confirms {}; compare with the panel's data sheet",
+            profile.name,
+            profile.description,
+            profile.unverified.join(", ")
+        ));
+    }
+    if rig.lasers.driver == LaserDriver::Simulated {
+        notes.push("the lasers are simulated: no light will be lit".into());
+    }
+    notes
+}
+
+fn laser_notes(rig: &Rig) -> Vec<String> {
     let mut notes = Vec::new();
-    notes.extend(rig.warnings());
     for (colour, power_mw) in rig.lasers.power_mw.iter().filter(|(colour, _)| rig.lasers.driver.has(*colour)) {
         if *power_mw == 0.0 {
             notes.push(format!("{colour}: the laser's power is 0, so this colour stays dark"));
@@ -590,6 +609,11 @@ fn notes(rig: &Rig) -> Vec<String> {
             at_the_head.join(", ")
         ));
     }
+    notes
+}
+
+fn optics_notes(rig: &Rig) -> Vec<String> {
+    let mut notes = Vec::new();
     if rig.panel.orientation != Orientation::Normal {
         notes.push(format!("pictures lie on the panel in the orientation {}", rig.panel.orientation.name()));
     }
@@ -611,19 +635,6 @@ fn notes(rig: &Rig) -> Vec<String> {
     if filled_mm.0.into_iter().any(|width_mm| width_mm < f64::from(PUPILS_MM[PUPILS_MM.len() - 1])) {
         let filled_mm = PerColourFigures::from(filled_mm);
         notes.push(format!("the half band fills {filled_mm} mm of the eyebox; a wider pupil is not filled"));
-    }
-    if let Some(profile) = rig.provenance.panel_profile.and_then(PanelProfile::named)
-        && !profile.unverified.is_empty()
-    {
-        notes.push(format!(
-            "panel profile {} ({}): no source confirms {}; compare with the panel's data sheet",
-            profile.name,
-            profile.description,
-            profile.unverified.join(", ")
-        ));
-    }
-    if rig.lasers.driver == LaserDriver::Simulated {
-        notes.push("the lasers are simulated: no light will be lit".into());
     }
     notes
 }
@@ -695,6 +706,33 @@ impl fmt::Display for TrackerMeaning {
 
 impl fmt::Display for Meaning {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.write_view(f)?;
+        self.write_eyebox(f)?;
+        self.write_fields(f)?;
+        write!(f, "{}{}", self.lasers, self.tracker)?;
+        if self.pupil_step_mm == 0.0 {
+            writeln!(f, "pupil step     none: each hologram is made for the pupil of its own time")?;
+        } else {
+            writeln!(
+                f,
+                "pupil step     {:.3} mm, {:.2} px of the largest blur: what moves less keeps its hologram",
+                self.pupil_step_mm, self.pupil_step_px
+            )?;
+        }
+        writeln!(f, "levels         {} bits, packing {}", self.bit_depth, self.packing)?;
+        if self.files.is_empty() {
+            writeln!(f, "files          none: phase is linear in the level, and the panel is taken as flat")?;
+        }
+        for file in &self.files {
+            writeln!(f, "{:<14} {}: {}", file.kind, file.colour, file.path.display())?;
+        }
+        self.notes.iter().try_for_each(|note| writeln!(f, "note           {note}"))
+    }
+}
+
+impl Meaning {
+    /// Who it is, and what of a scene it can show.
+    fn write_view(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "rig            {}", self.name)?;
         if let Some(hash) = &self.text_hash {
             write!(f, " ({}, {hash})", self.origin)?;
@@ -718,7 +756,11 @@ impl fmt::Display for Meaning {
             f,
             "depth          {:.3} to {:.3} dioptres: {far_m} to {:.2} m, u = {:.3} to {:.3} mm",
             self.depth_far_dpt, self.depth_near_dpt, self.depth_near_m, self.u_far_mm, self.u_near_mm
-        )?;
+        )
+    }
+
+    /// Where a pupil sees how much of the light, and how sharply.
+    fn write_eyebox(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "eyebox         {} mm", self.eyebox_mm)?;
         writeln!(f, "half band      fills {} mm of the eyebox", self.half_band_eyebox_mm)?;
         writeln!(
@@ -727,13 +769,17 @@ impl fmt::Display for Meaning {
             self.smooth_phase_blur_px
         )?;
         writeln!(f, "panel's band   {} mrad either side", self.panel_half_angle_mrad)?;
-        for blur in &self.blurs {
+        self.blurs.iter().try_for_each(|blur| {
             writeln!(
                 f,
                 "pupil {} mm     blur up to {:.1} px; needs {:.1} mrad, of the panel's band {}",
                 blur.pupil_mm, blur.largest_blur_px, blur.half_angle_needed_mrad, blur.share_of_panel_band
-            )?;
-        }
+            )
+        })
+    }
+
+    /// When each colour is on the panel, and lit.
+    fn write_fields(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let field = &self.field;
         writeln!(
             f,
@@ -761,31 +807,13 @@ impl fmt::Display for Meaning {
                 lit_share * 100.0,
                 self.lasers.shown.unwrap_or("each colour"),
                 time_share * 100.0
-            )?,
-            (.., None) => writeln!(f, "; lit as the panel gates the lasers, whatever on_delay_ms and lit_ms say")?,
+            ),
+            (.., None) => writeln!(f, "; lit as the panel gates the lasers, whatever on_delay_ms and lit_ms say"),
             _ => writeln!(
                 f,
                 "; the laser is on while it is armed: lit for 100 % of it, while the phase settles, too, whatever \
                  on_delay_ms and lit_ms say"
-            )?,
+            ),
         }
-        write!(f, "{}{}", self.lasers, self.tracker)?;
-        if self.pupil_step_mm == 0.0 {
-            writeln!(f, "pupil step     none: each hologram is made for the pupil of its own time")?;
-        } else {
-            writeln!(
-                f,
-                "pupil step     {:.3} mm, {:.2} px of the largest blur: what moves less keeps its hologram",
-                self.pupil_step_mm, self.pupil_step_px
-            )?;
-        }
-        writeln!(f, "levels         {} bits, packing {}", self.bit_depth, self.packing)?;
-        if self.files.is_empty() {
-            writeln!(f, "files          none: phase is linear in the level, and the panel is taken as flat")?;
-        }
-        for file in &self.files {
-            writeln!(f, "{:<14} {}: {}", file.kind, file.colour, file.path.display())?;
-        }
-        self.notes.iter().try_for_each(|note| writeln!(f, "note           {note}"))
     }
 }

@@ -5,11 +5,11 @@ use std::time::Instant;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{Dioptres, DisplayGeometry};
-use holod_model::ComplexHologram;
 use holod_model::engine::{EngineError, FocalStackEngine, Precision};
 use holod_model::files::{self, BenchOptics, RigHash, StoredHologram};
 use holod_model::optics::{DoublePhase, PhasePattern};
-use holod_model::scene::FocalStackFiles;
+use holod_model::scene::{FocalStack, FocalStackFiles, FocalStackReport};
+use holod_model::{ComplexHologram, Weights};
 use serde::Serialize;
 
 use super::hologram_files::{FILES, save};
@@ -59,33 +59,18 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     let staging = Staging::new(&args.out, &FILES, args.force)?;
     let weights = progress::during("loading the network", || setup::weights_for_one_pupil(rig))?;
     let name = directory.display().to_string();
-    let at_fault = |error: EngineError| match error {
-        EngineError::Focuses { .. } => Failure::new(Exit::Data, format!("{name}/stack.toml: {error}")),
-        other => renderer::failure(other),
-    };
-    let files = FocalStackFiles::open(directory).map_err(scene::failure)?;
-    FocalStackEngine::check(&weights, &rig.geometry, files.focuses()).map_err(at_fault)?;
-    setup::check_pupil(&weights, &rig.geometry, files.pupil())
-        .map_err(|why| Failure::new(Exit::Data, format!("{name}/stack.toml: `pupil_mm`: {why}")))?;
-    let (stack, done) = progress::during("loading the focal stack", || {
-        files.load(args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
-    })?;
+    let (stack, done) = load(args, rig, &weights, directory)?;
     let resolution = stack.resolution;
-    scene::warn_of_clipped_colours(&name, done.colour_clipped, done.source_px);
-    if done.has_foreign_primaries {
-        scene::warn_of_foreign_primaries(&name);
-    }
-    scene::check_fits(resolution, &rig.geometry, &name)?;
     let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
         let precision = if args.backend == Backend::Cpu { Precision::Single } else { Precision::Half };
-        FocalStackEngine::new(&weights, &rig.geometry, resolution, precision).map_err(at_fault)
+        FocalStackEngine::new(&weights, &rig.geometry, resolution, precision).map_err(|error| at_fault(&name, error))
     })?;
     let amplitude_constant = weights.config().amplitude_constant;
     let mut double_phase = DoublePhase::new(resolution, amplitude_constant);
     let (mut hologram, mut pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
     let computing = Instant::now();
     let clipped_share = progress::during(&format!("computing the hologram of {resolution}"), || {
-        engine.render(&stack, &mut hologram).map_err(at_fault)?;
+        engine.render(&stack, &mut hologram).map_err(|error| at_fault(&name, error))?;
         renderer::check_numbers(&hologram)?;
         Ok::<_, Failure>(double_phase.encode(&hologram, &mut pattern).clipped_share)
     })?;
@@ -121,9 +106,44 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     if args.json {
         return results::print_json(&report);
     }
-    results::print(&format!(
-        "{}: hologram of {resolution} from {} images for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % \
-         of amplitudes clipped\nfocused from {:.2} to {:.2} dpt; pixels clipped {}, padded {}\nin {}: {}",
+    results::print(&in_words(&report, &args.out))
+}
+
+/// The stack in `directory`, as far as it suits the rig and the network.
+fn load(
+    args: &RenderArgs,
+    rig: &Rig,
+    weights: &Weights,
+    directory: &Path,
+) -> Result<(FocalStack, FocalStackReport), Failure> {
+    let name = directory.display().to_string();
+    let files = FocalStackFiles::open(directory).map_err(scene::failure)?;
+    FocalStackEngine::check(weights, &rig.geometry, files.focuses()).map_err(|error| at_fault(&name, error))?;
+    setup::check_pupil(weights, &rig.geometry, files.pupil())
+        .map_err(|why| Failure::new(Exit::Data, format!("{name}/stack.toml: `pupil_mm`: {why}")))?;
+    let (stack, done) = progress::during("loading the focal stack", || {
+        files.load(args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
+    })?;
+    scene::warn_of_clipped_colours(&name, done.colour_clipped, done.source_px);
+    if done.has_foreign_primaries {
+        scene::warn_of_foreign_primaries(&name);
+    }
+    scene::check_fits(stack.resolution, &rig.geometry, &name)?;
+    Ok((stack, done))
+}
+
+fn at_fault(name: &str, error: EngineError) -> Failure {
+    match error {
+        EngineError::Focuses { .. } => Failure::new(Exit::Data, format!("{name}/stack.toml: {error}")),
+        other => renderer::failure(other),
+    }
+}
+
+fn in_words(report: &Report, out: &Path) -> String {
+    let [width_px, height_px] = [report.width_px, report.height_px];
+    format!(
+        "{}: hologram of {width_px}x{height_px} from {} images for a pupil of {} mm in {:.0} ms, {:.1} s with all else; \
+         {:.3} % of amplitudes clipped\nfocused from {:.2} to {:.2} dpt; pixels clipped {}, padded {}\nin {}: {}",
         report.focal_stack,
         report.focus_dpt.len(),
         report.pupil_mm,
@@ -134,7 +154,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
         report.focus_dpt[report.focus_dpt.len() - 1],
         report.colour_clipped_px,
         report.padded_px,
-        args.out.display(),
+        out.display(),
         FILES.join(", ")
-    ))
+    )
 }

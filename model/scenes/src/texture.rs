@@ -176,16 +176,11 @@ impl Pattern {
                 let odd = ((x / period).floor() as i32 + (y / period).floor() as i32) & 1 == 1;
                 if odd { a } else { b }
             }
-            Self::Stripes { a, b, period, duty, sine } => {
-                let phase = (x / period).rem_euclid(1.0);
-                if sine {
-                    blend(a, b, 0.5 + 0.5 * (std::f32::consts::TAU * phase).sin())
-                } else if phase < duty {
-                    a
-                } else {
-                    b
-                }
-            }
+            Self::Stripes { a, b, period, duty, sine } => match (x / period).rem_euclid(1.0) {
+                phase if sine => blend(a, b, 0.5 + 0.5 * (std::f32::consts::TAU * phase).sin()),
+                phase if phase < duty => a,
+                _ => b,
+            },
             Self::Noise { a, b, scale, octaves, contrast, seed } => {
                 let value = fractal_noise(x / scale, y / scale, octaves, seed);
                 blend(a, b, (0.5 + (value - 0.5) * contrast).clamp(0.0, 1.0))
@@ -204,47 +199,31 @@ impl Pattern {
                 shade_of_polygon(x, y, cell, seed).map_or(ground, |shade| blend(a, b, shade))
             }
             Self::Ticks { ground, mark, cell, width, seed } => {
-                let (column, row) = cell_at(x, y, cell);
-                let (sin, cos) = (std::f32::consts::PI * hash_unit(column, row, seed)).sin_cos();
-                let (dx, dy) = (x - (column as f32 + 0.5) * cell, y - (row as f32 + 0.5) * cell);
-                let inside = (dx * sin - dy * cos).abs() < 0.5 * width && (dx * cos + dy * sin).abs() < 0.38 * cell;
-                if inside { mark } else { ground }
-            }
-            Self::Bricks { brick, mortar, width, height, joint, seed } => {
-                let row = (y / height).floor();
-                let shifted = x + 0.5 * width * (row as i32 & 1) as f32;
-                let column = (shifted / width).floor();
-                let inside = y - row * height > joint && shifted - column * width > joint;
-                let shade = 0.55 + 0.45 * hash_unit(column as i32, row as i32, seed);
-                if inside { brick.map(|c| c * shade) } else { mortar }
-            }
-            Self::Rings { a, b, period } => {
-                if (x.hypot(y) / period).rem_euclid(1.0) < 0.5 {
-                    a
+                if is_on_tick(x, y, cell, width, seed) {
+                    mark
                 } else {
-                    b
+                    ground
                 }
             }
+            Self::Bricks { brick, mortar, width, height, joint, seed } => {
+                brightness_of_brick(x, y, [width, height], joint, seed)
+                    .map_or(mortar, |brightness| brick.map(|c| c * brightness))
+            }
+            Self::Rings { a, b, period } => {
+                let is_first = (x.hypot(y) / period).rem_euclid(1.0) < 0.5;
+                if is_first { a } else { b }
+            }
             Self::Plaid { a, b, c, period } => {
-                let band = |place: f32| match (place / period).rem_euclid(1.0) {
-                    t if t < 0.4 => a,
-                    t if t < 0.5 => c,
-                    t if t < 0.9 => b,
-                    _ => c,
-                };
+                let band = |place: f32| colour_of_band([a, b, c], place / period);
                 blend(band(x), band(y), 0.5)
             }
             Self::Mosaic { cell, saturation, seed } => {
                 let (column, row) = nearest_point(x, y, cell, seed);
-                let bright = 0.15 + 0.85 * hash_unit(column, row, seed ^ 2);
-                let vivid = |salt| 1.0 - saturation * hash_unit(column, row, seed ^ salt);
-                [bright * vivid(3), bright * vivid(4), bright * vivid(5)]
+                colour_of_tile(column, row, saturation, seed)
             }
             Self::Natural { mean, tint, contrast, chroma, seed } => {
                 let luminance = mean * (contrast * pink_noise(x, y, seed)).exp();
-                let blue_yellow = chroma * pink_noise(x, y, seed ^ 0x51);
-                let red_green = 0.5 * chroma * pink_noise(x, y, seed ^ 0xa7);
-                let balance = [1.0 + blue_yellow + red_green, 1.0 + blue_yellow - red_green, 1.0 - blue_yellow];
+                let balance = pink_chroma(x, y, chroma, seed);
                 std::array::from_fn(|c| (luminance * tint[c] * balance[c]).clamp(0.0, 1.0))
             }
             Self::DeadLeaves { hue, saturation, largest, seed } => {
@@ -254,23 +233,15 @@ impl Pattern {
                 let sum: f32 = waves.iter().map(|w| w.amplitude * (w.kx * x + w.ky * y + w.phase).cos()).sum();
                 blend(a, b, (0.5 + sum).clamp(0.0, 1.0))
             }
-            Self::Wood { a, b, ring, warp, seed } => {
-                let bend = fractal_noise(x / (8.0 * ring), y / (2.0 * ring), 3, seed) * warp;
-                let fibre = fractal_noise(x / 24.0, y / 1.6, 2, seed ^ 9);
-                let phase = ((x * 0.15).hypot(y + 3.0 * ring) / ring + bend).rem_euclid(1.0);
-                blend(a, b, (phase * phase * 0.75 + 0.35 * fibre).clamp(0.0, 1.0))
-            }
+            Self::Wood { a, b, ring, warp, seed } => blend(a, b, darkness_of_wood(x, y, ring, warp, seed)),
             Self::Marble { a, b, scale, warp, seed } => {
                 let bend = fractal_noise(x / scale, y / scale, 4, seed) * warp;
                 let vein = ((x + 0.6 * y) / scale * 2.0 + bend).sin().abs();
                 blend(a, b, vein.powf(0.6))
             }
             Self::Weave { a, b, period } => {
-                let (u, v) = (x / period, y / period);
-                let over = (u.floor() as i32 + v.floor() as i32) & 1 == 0;
-                let across = if over { u.rem_euclid(1.0) } else { v.rem_euclid(1.0) };
-                let round = (std::f32::consts::PI * across).sin();
-                blend([0.0; 3], if over { a } else { b }, 0.25 + 0.75 * round)
+                let (is_first, brightness) = thread_on_top(x / period, y / period);
+                blend([0.0; 3], if is_first { a } else { b }, brightness)
             }
         }
     }
@@ -279,6 +250,62 @@ impl Pattern {
 /// Column and row of the square cell around a point.
 fn cell_at(x: f32, y: f32, cell: f32) -> (i32, i32) {
     ((x / cell).floor() as i32, (y / cell).floor() as i32)
+}
+
+/// Whether a point is on the short line of its cell, which lies at a direction of its own.
+fn is_on_tick(x: f32, y: f32, cell: f32, width: f32, seed: u32) -> bool {
+    let (column, row) = cell_at(x, y, cell);
+    let (sin, cos) = (std::f32::consts::PI * hash_unit(column, row, seed)).sin_cos();
+    let (dx, dy) = (x - (column as f32 + 0.5) * cell, y - (row as f32 + 0.5) * cell);
+    (dx * sin - dy * cos).abs() < 0.5 * width && (dx * cos + dy * sin).abs() < 0.38 * cell
+}
+
+/// The brightness, 0.55 to 1, of the brick at a point; none in a joint.
+fn brightness_of_brick(x: f32, y: f32, [width, height]: [f32; 2], joint: f32, seed: u32) -> Option<f32> {
+    let row = (y / height).floor();
+    let shifted = x + 0.5 * width * (row as i32 & 1) as f32;
+    let column = (shifted / width).floor();
+    let is_inside = y - row * height > joint && shifted - column * width > joint;
+    is_inside.then(|| 0.55 + 0.45 * hash_unit(column as i32, row as i32, seed))
+}
+
+/// The first and the second colour in turn, and between them narrow bands of the third; the place is in periods.
+fn colour_of_band([a, b, between]: [Rgb; 3], place: f32) -> Rgb {
+    match place.rem_euclid(1.0) {
+        t if t < 0.4 => a,
+        t if t < 0.5 => between,
+        t if t < 0.9 => b,
+        _ => between,
+    }
+}
+
+fn colour_of_tile(column: i32, row: i32, saturation: f32, seed: u32) -> Rgb {
+    let bright = 0.15 + 0.85 * hash_unit(column, row, seed ^ 2);
+    let vivid = |salt| 1.0 - saturation * hash_unit(column, row, seed ^ salt);
+    [bright * vivid(3), bright * vivid(4), bright * vivid(5)]
+}
+
+/// Factors of red, green and blue around 1, whose differences along blue-yellow and red-green are pink noise.
+fn pink_chroma(x: f32, y: f32, chroma: f32, seed: u32) -> Rgb {
+    let blue_yellow = chroma * pink_noise(x, y, seed ^ 0x51);
+    let red_green = 0.5 * chroma * pink_noise(x, y, seed ^ 0xa7);
+    [1.0 + blue_yellow + red_green, 1.0 + blue_yellow - red_green, 1.0 - blue_yellow]
+}
+
+/// From early wood, 0, to late wood, 1, in rings this wide, with the grain along x.
+fn darkness_of_wood(x: f32, y: f32, ring: f32, warp: f32, seed: u32) -> f32 {
+    let bend = fractal_noise(x / (8.0 * ring), y / (2.0 * ring), 3, seed) * warp;
+    let fibre = fractal_noise(x / 24.0, y / 1.6, 2, seed ^ 9);
+    let phase = ((x * 0.15).hypot(y + 3.0 * ring) / ring + bend).rem_euclid(1.0);
+    (phase * phase * 0.75 + 0.35 * fibre).clamp(0.0, 1.0)
+}
+
+/// Whether the thread on top is one of the first kind, and how bright its rounding is there, 0.25 to 1; the point is in
+/// widths of a thread.
+fn thread_on_top(u: f32, v: f32) -> (bool, f32) {
+    let is_first = (u.floor() as i32 + v.floor() as i32) & 1 == 0;
+    let across = if is_first { u.rem_euclid(1.0) } else { v.rem_euclid(1.0) };
+    (is_first, 0.25 + 0.75 * (std::f32::consts::PI * across).sin())
 }
 
 /// Whether a point is in the dot of its cell, which this share of all cells have.

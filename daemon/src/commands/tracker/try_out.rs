@@ -51,6 +51,16 @@ const REDRAW: TimeNs = TimeNs(200_000_000);
 /// The live plot's length.
 const PLOTTED_S: f64 = 10.0;
 
+/// A tracker that is tried, and what has come of it so far.
+struct Trial {
+    spec: TrackerSpec,
+    began: TimeNs,
+    tracker: TrackerHandle,
+    folder: Option<RecordFolder>,
+    observed: Observed,
+    refusals: RefusalWatch,
+}
+
 pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     let mut rig = setup::rig(&args.rig)?;
     let spec = spec_of(args, &rig)?;
@@ -58,123 +68,149 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         rig.tracker.scale = Some(scale);
     }
     let signals = Signals::install(None)?;
-    let mut folder = args.record.as_deref().map(|path| RecordFolder::claim(path, args.force)).transpose()?;
-    let began = host_now();
-    let options = TrackerOptions {
-        origin: began,
-        record: folder.as_ref().map(|folder| RecordFiles::in_folder(folder.path())),
-        forbidden: setup::ports_of_others(&rig),
-        ..TrackerOptions::default()
-    };
-    let mut tracker = Tracker::start(&spec, &rig.tracker, options).map_err(setup::tracker_failure)?;
-    if !args.json {
-        for warning in tracker.control.warnings() {
-            tracing::warn!("{warning}");
-        }
-        for remark in tracker.control.remarks() {
-            tracing::info!("{remark}");
-        }
-    }
-    let mut observed = Observed::default();
-    let mut refusals = RefusalWatch::new(&rig.tracker, tracker.control.figures(), began);
-    let mut clock = ClockWatch::default();
+    let mut trial = Trial::start(args, &rig, spec)?;
     let mut live = LiveText::default();
-    let mut redrawn = began;
-    let ended_by = loop {
-        std::thread::sleep(TICK);
-        let now = host_now();
-        keep_what_came(folder.as_mut(), &tracker)?;
-        // There is not room for many, and the last one tells that the link is back.
-        tracker.control.trouble();
-        while let Some(decision) = tracker.decisions.pop() {
-            observed.take(&decision);
-            refusals.note(&decision);
-        }
-        if let Some(wrong) = clock.judge(now, tracker.control.clock(), &tracker.control.counters()) {
-            tracing::warn!("{wrong}");
-        }
-        if let Some(signal) = signals.caught() {
-            break signal.to_owned();
-        }
-        if (now - began).seconds() >= args.duration.as_secs_f64() {
-            break "the asked duration".to_owned();
-        }
-        if tracker.control.finished() {
-            break "the end of the pupil log".to_owned();
-        }
-        if !args.json && now - redrawn >= REDRAW {
-            redrawn = now;
-            let state = report_of(&spec, "", began, now, &observed, &mut tracker);
-            let text = text_of(&state);
-            live.show(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())));
-        }
-    };
-    keep_what_came(folder.as_mut(), &tracker)?;
+    let ended_by = trial.watch(args, &signals, &mut live)?;
+    trial.keep_what_came()?;
     let now = host_now();
-    let last = report_of(&spec, &ended_by, began, now, &observed, &mut tracker);
-    tracker.control.stop();
-    while let Some(decision) = tracker.decisions.pop() {
-        observed.take(&decision);
-        refusals.note(&decision);
-    }
+    let last = trial.report(&ended_by, now);
+    trial.tracker.control.stop();
+    trial.take_decisions();
     // Counts and figures are of all samples; link and pupil as they were before the tracker was stopped.
     let Report { link, pupil_mm, pupil_state, trouble, .. } = last;
-    let report = Report {
-        link,
-        pupil_mm,
-        pupil_state,
-        trouble,
-        ..report_of(&spec, &ended_by, began, now, &observed, &mut tracker)
-    };
+    let report = Report { link, pupil_mm, pupil_state, trouble, ..trial.report(&ended_by, now) };
     if args.json {
         results::print_json(&report)?;
     } else {
         live.show("");
-        let text = text_of(&report);
-        results::print(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())))?;
+        results::print(&trial.picture(&report, now))?;
     }
-    refusals.judge(now, &tracker.control.counters(), true);
-    judge(&spec, &tracker, &observed, &refusals, report.trouble)
+    trial.refusals.judge(now, &trial.tracker.control.counters(), true);
+    trial.judge(report.trouble)
 }
 
-/// Whether samples were believed, and their recording is whole.
-///
-/// # Errors
-/// Why not, and what to do about it; `trouble` is why a link that was lost did not come back.
-fn judge(
-    spec: &TrackerSpec,
-    tracker: &TrackerHandle,
-    observed: &Observed,
-    refusals: &RefusalWatch,
-    trouble: Option<String>,
-) -> Result<(), Failure> {
-    if let Some(failure) = tracker.control.recording().and_then(|recording| recording.failure) {
-        return Err(Failure::new(Exit::CannotCreate, format!("the recording is not whole: {failure}")));
-    }
-    if observed.accepted() > 0 {
-        return Ok(());
-    }
-    let counters = tracker.control.counters();
-    // Logs and simulated eyes have no bytes.
-    let [bytes, samples] = [Counter::Bytes, Counter::Samples].map(|counter| counters.of(counter));
-    let came = |refusal: &&Refusal| refusal.refused > 0 || bytes > 0 && trouble.is_none();
-    let heard = match refusals.current().filter(came) {
-        Some(refusal) => refusal.to_string(),
-        None if samples > 0 => {
-            format!("{samples} samples came, and none was believed yet: give it a longer --duration")
+impl Trial {
+    fn start(args: &TryArgs, rig: &Rig, spec: TrackerSpec) -> Result<Self, Failure> {
+        let folder = args.record.as_deref().map(|path| RecordFolder::claim(path, args.force)).transpose()?;
+        let began = host_now();
+        let options = TrackerOptions {
+            origin: began,
+            record: folder.as_ref().map(|folder| RecordFiles::in_folder(folder.path())),
+            forbidden: setup::ports_of_others(rig),
+            ..TrackerOptions::default()
+        };
+        let tracker = Tracker::start(&spec, &rig.tracker, options).map_err(setup::tracker_failure)?;
+        if !args.json {
+            for warning in tracker.control.warnings() {
+                tracing::warn!("{warning}");
+            }
+            for remark in tracker.control.remarks() {
+                tracing::info!("{remark}");
+            }
         }
-        None => trouble.unwrap_or_else(|| {
-            "nothing was heard; is it switched on, and does it send without being asked?".to_owned()
-        }),
-    };
-    Err(Failure::new(Exit::Unavailable, format!("tracker {spec}: {heard}")))
-}
+        let refusals = RefusalWatch::new(&rig.tracker, tracker.control.figures(), began);
+        Ok(Self { spec, began, tracker, folder, observed: Observed::default(), refusals })
+    }
 
-/// A recording of silence is not worth keeping, and takes no earlier one's place.
-fn keep_what_came(folder: Option<&mut RecordFolder>, tracker: &TrackerHandle) -> Result<(), Failure> {
-    let counters = tracker.control.counters();
-    let came = counters.of(Counter::Bytes) > 0 || counters.of(Counter::Samples) > 0;
-    folder.filter(|_| came).map_or(Ok(()), RecordFolder::keep)
+    /// Shows what comes until there is a reason to end, which it returns.
+    fn watch(&mut self, args: &TryArgs, signals: &Signals, live: &mut LiveText) -> Result<String, Failure> {
+        let mut clock = ClockWatch::default();
+        let mut redrawn = self.began;
+        loop {
+            std::thread::sleep(TICK);
+            let now = host_now();
+            self.keep_what_came()?;
+            // There is not room for many, and the last one tells that the link is back.
+            self.tracker.control.trouble();
+            self.take_decisions();
+            let control = &mut self.tracker.control;
+            if let Some(wrong) = clock.judge(now, control.clock(), &control.counters()) {
+                tracing::warn!("{wrong}");
+            }
+            if let Some(signal) = signals.caught() {
+                return Ok(signal.to_owned());
+            }
+            if (now - self.began).seconds() >= args.duration.as_secs_f64() {
+                return Ok("the asked duration".to_owned());
+            }
+            if control.finished() {
+                return Ok("the end of the pupil log".to_owned());
+            }
+            if !args.json && now - redrawn >= REDRAW {
+                redrawn = now;
+                let report = self.report("", now);
+                live.show(&self.picture(&report, now));
+            }
+        }
+    }
+
+    fn take_decisions(&mut self) {
+        while let Some(decision) = self.tracker.decisions.pop() {
+            self.observed.take(&decision);
+            self.refusals.note(&decision);
+        }
+    }
+
+    /// A recording of silence is not worth keeping, and takes no earlier one's place.
+    fn keep_what_came(&mut self) -> Result<(), Failure> {
+        let counters = self.tracker.control.counters();
+        let came = counters.of(Counter::Bytes) > 0 || counters.of(Counter::Samples) > 0;
+        self.folder.as_mut().filter(|_| came).map_or(Ok(()), RecordFolder::keep)
+    }
+
+    fn report(&mut self, ended_by: &str, now: TimeNs) -> Report {
+        let tracker = &mut self.tracker;
+        let estimate = tracker.estimate.pupil_at(now);
+        Report {
+            tracker: self.spec.to_string(),
+            ended_by: ended_by.to_owned(),
+            duration_s: (now - self.began).seconds(),
+            link: tracker.control.link().name(),
+            eyes: self.observed.figures(),
+            pupil_mm: estimate.pupil.mm(),
+            pupil_state: estimate.state.name(),
+            clock_drift_ppm: tracker.control.clock().map(|clock| clock.drift_ppm),
+            delay_spread_ms: tracker.control.clock().map(|clock| clock.delay_spread.seconds() * 1e3),
+            counts: tracker.control.counters().entries().collect(),
+            records_lost: tracker.control.recording().map_or(0, |status| status.chunks_lost + status.decisions_lost),
+            trouble: tracker.control.trouble().map(str::to_owned),
+            warnings: tracker.control.warnings().to_vec(),
+        }
+    }
+
+    /// The plots above the report's text, as large as the terminal lets them be.
+    fn picture(&self, report: &Report, now: TimeNs) -> String {
+        let text = text_of(report);
+        format!("{}\n{text}", traces(&self.observed, now, LiveText::visible(), text.lines().count()))
+    }
+
+    /// Whether samples were believed, and their recording is whole.
+    ///
+    /// # Errors
+    /// Why not, and what to do about it; `trouble` is why a link that was lost did not come back.
+    fn judge(&self, trouble: Option<String>) -> Result<(), Failure> {
+        let Self { spec, tracker, observed, refusals, .. } = self;
+        if let Some(failure) = tracker.control.recording().and_then(|recording| recording.failure) {
+            return Err(Failure::new(Exit::CannotCreate, format!("the recording is not whole: {failure}")));
+        }
+        if observed.accepted() > 0 {
+            return Ok(());
+        }
+        let counters = tracker.control.counters();
+        // Logs and simulated eyes have no bytes.
+        let [bytes, samples] = [Counter::Bytes, Counter::Samples].map(|counter| counters.of(counter));
+        let came = |refusal: &&Refusal| refusal.refused > 0 || bytes > 0 && trouble.is_none();
+        let heard = match refusals.current().filter(came) {
+            Some(refusal) => refusal.to_string(),
+            None if samples > 0 => {
+                format!("{samples} samples came, and none was believed yet: give it a longer --duration")
+            }
+            None => trouble.unwrap_or_else(|| {
+                "nothing was heard; is it switched on, and does it send without being asked?".to_owned()
+            }),
+        };
+        Err(Failure::new(Exit::Unavailable, format!("tracker {spec}: {heard}")))
+    }
 }
 
 fn spec_of(args: &TryArgs, rig: &Rig) -> Result<TrackerSpec, Failure> {
@@ -187,32 +223,6 @@ fn spec_of(args: &TryArgs, rig: &Rig) -> Result<TrackerSpec, Failure> {
         bug_report::refuse_archive(path)?;
     }
     Ok(spec)
-}
-
-fn report_of(
-    spec: &TrackerSpec,
-    ended_by: &str,
-    began: TimeNs,
-    now: TimeNs,
-    observed: &Observed,
-    tracker: &mut TrackerHandle,
-) -> Report {
-    let estimate = tracker.estimate.pupil_at(now);
-    Report {
-        tracker: spec.to_string(),
-        ended_by: ended_by.to_owned(),
-        duration_s: (now - began).seconds(),
-        link: tracker.control.link().name(),
-        eyes: observed.figures(),
-        pupil_mm: estimate.pupil.mm(),
-        pupil_state: estimate.state.name(),
-        clock_drift_ppm: tracker.control.clock().map(|clock| clock.drift_ppm),
-        delay_spread_ms: tracker.control.clock().map(|clock| clock.delay_spread.seconds() * 1e3),
-        counts: tracker.control.counters().entries().collect(),
-        records_lost: tracker.control.recording().map_or(0, |status| status.chunks_lost + status.decisions_lost),
-        trouble: tracker.control.trouble().map(str::to_owned),
-        warnings: tracker.control.warnings().to_vec(),
-    }
 }
 
 /// The last seconds of all eyes, above `rows_below` rows of text: rejected and believed.
