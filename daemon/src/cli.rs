@@ -295,7 +295,7 @@ pub struct RunArgs {
     /// last picture stays lit when left out.
     #[arg(long, value_name = "SECONDS", value_parser = parse_silence)]
     pub feed_dark_after: Option<Duration>,
-    /// Where patterns go.
+    /// Where patterns go, by a spec; the help names those that there are.
     #[arg(
         long,
         value_name = "SPEC",
@@ -365,7 +365,7 @@ pub struct PageArgs {
     pub page_token: Option<PathBuf>,
 }
 
-/// Options of `demo`.
+/// What `holod demo` takes; its bench is the built-in one.
 #[derive(Args, Debug, Clone)]
 pub struct DemoArgs {
     /// Weights in place of those of the built-in bench.
@@ -385,7 +385,7 @@ pub struct DemoArgs {
     pub duration: Duration,
 }
 
-/// Options of `render`.
+/// What `holod render` takes: a bench, a picture and a pupil, and where the hologram goes.
 #[derive(Args, Debug, Clone)]
 pub struct RenderArgs {
     /// The bench that the hologram is made for.
@@ -419,7 +419,7 @@ pub struct RenderArgs {
     pub json: bool,
 }
 
-/// Options of `view`.
+/// What `holod view` takes: a hologram or what to make one of, and the eye that looks at it.
 #[derive(Args, Debug, Clone)]
 pub struct ViewArgs {
     /// The bench through which the eye looks.
@@ -458,7 +458,7 @@ pub struct ViewArgs {
     pub json: bool,
 }
 
-/// Options of `check`.
+/// What `holod check` takes: a bench, and what of `run` is to be judged with it.
 #[derive(Args, Debug, Clone)]
 pub struct CheckArgs {
     /// The bench that is checked.
@@ -492,7 +492,7 @@ pub struct CheckArgs {
     pub json: bool,
 }
 
-/// Options of `unit`.
+/// What `holod unit` takes: what the service is to run with.
 #[derive(Args, Debug, Clone)]
 pub struct UnitArgs {
     /// The options of `run` with which the service is to run.
@@ -500,7 +500,7 @@ pub struct UnitArgs {
     pub run: RunArgs,
 }
 
-/// Options of `bench`.
+/// What `holod bench` takes: a bench, and what is measured how often.
 #[derive(Args, Debug, Clone)]
 pub struct BenchArgs {
     /// The bench for whose panel and network times are measured.
@@ -532,7 +532,7 @@ pub struct BenchArgs {
     pub json: bool,
 }
 
-/// Options of `evaluate`.
+/// What `holod evaluate` takes: a network, and the scenes by which it is judged.
 #[derive(Args, Debug, Clone)]
 pub struct EvaluateArgs {
     /// The rig, whose panel the levels are for.
@@ -573,7 +573,7 @@ pub struct EvaluateArgs {
     pub force: bool,
 }
 
-/// Options of `ctl`.
+/// What `holod ctl` takes: which holod is meant, and its order.
 #[derive(Args, Debug, Clone)]
 pub struct CtlArgs {
     /// Of several that run, the one of this process number.
@@ -622,7 +622,7 @@ pub enum CtlOrder {
     },
     /// Follow another eye: left, right, both (their mean) or better (the one of which the tracker is surer).
     Eye {
-        /// Which.
+        /// The eye that is followed from now on.
         #[arg(value_name = "EYE", value_parser = parse_eye)]
         eye: Eye,
     },
@@ -633,11 +633,11 @@ pub enum CtlOrder {
     Pattern(PatternKind<PatternPlace>),
     /// Show one phase everywhere in place of holograms.
     Flat,
-    /// Show holograms again.
+    /// Show holograms again, after a pattern or one phase.
     Hologram,
     /// Keep the lasers dark, or let them be lit by the rules again.
     Lasers {
-        /// Which.
+        /// Whether they stay dark or may be lit.
         #[arg(value_enum)]
         lasers: LasersArg,
     },
@@ -667,7 +667,7 @@ fn parse_pupil_or_follow(text: &str) -> Result<PupilOrder, String> {
     if text == "follow" { Ok(PupilOrder::Follow) } else { parse_pupil(text).map(PupilOrder::Fixed) }
 }
 
-/// Options of `status`.
+/// What `holod status` takes: which holod is meant.
 #[derive(Args, Debug, Clone)]
 pub struct StatusArgs {
     /// Of several that run, the one of this process number.
@@ -678,7 +678,7 @@ pub struct StatusArgs {
     pub json: bool,
 }
 
-/// Options of `report`.
+/// What `holod report` takes: a recording, or none, and the archive's place.
 #[derive(Args, Debug, Clone)]
 pub struct ReportArgs {
     /// What `holod run --record` wrote; without it, facts of this machine and the status of a holod that runs.

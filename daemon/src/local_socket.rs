@@ -40,7 +40,7 @@ pub enum SocketError {
     Listen { socket: PathBuf, error: io::Error },
 }
 
-/// Where somebody listens.
+/// A path on which a process listens, and the socket that it made there.
 #[derive(Debug)]
 pub(crate) struct SocketPlace {
     path: PathBuf,

@@ -35,7 +35,7 @@ impl ServiceLasers {
         Self { not_opened: runtime.join("lasers-not-opened"), to_put_out: state.join("lasers-to-put-out") }
     }
 
-    /// A start begins.
+    /// Notes that the lasers are not open yet, unless an earlier start still owes their darkness.
     pub(crate) fn begin(&self) {
         match self.to_put_out.try_exists() {
             Ok(false) => {

@@ -135,7 +135,6 @@ impl Temporary {
         })
     }
 
-    /// Where it is.
     pub(crate) fn path(&self) -> &Path {
         self.0.path()
     }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// One of a few reasons.
 pub(crate) trait Reason: Copy + PartialEq + 'static {
-    /// All of them.
+    /// Every reason, in the order of their counts.
     const ALL: &'static [Self];
 
     /// What it is called in a status and in figures.
@@ -26,7 +26,7 @@ impl<R: Reason> Default for TallyBy<R> {
 }
 
 impl<R: Reason> TallyBy<R> {
-    /// One more.
+    /// Counts one more of this reason.
     pub(crate) fn count(&self, reason: R) {
         let counts = R::ALL.iter().zip(&self.counts);
         for (_, count) in counts.filter(|(known, _)| **known == reason) {

@@ -17,7 +17,7 @@ const FEWEST_PX: usize = 256;
 /// Where a stack of pictures is black at every focus, and so is all within 16 px each way.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DarkArea {
-    /// [height, width]
+    /// Whether each pixel is in it, [height, width].
     inside: Vec<bool>,
 }
 

@@ -27,7 +27,7 @@ pub fn depth_on(bench: &DisplayGeometry, card: Dioptres) -> Dioptres {
 /// The inner part of one card.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CardArea {
-    /// [height, width]
+    /// Whether each pixel is in it, [height, width].
     inside: Vec<bool>,
 }
 

@@ -56,9 +56,9 @@ pub(crate) trait Simd: Copy + Send + Sync {
         // SAFETY: this many are writable.
         unsafe { self.store(to.as_mut_ptr(), vector) }
     }
-    /// a·b + c
+    /// a·b + c of each lane.
     fn mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
-    /// c − a·b
+    /// c − a·b of each lane.
     fn neg_mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     fn add(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     fn sub(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
@@ -237,7 +237,7 @@ impl Products {
         }
     }
 
-    /// The vectors.
+    /// The instruction set of its vectors.
     pub(crate) fn set(self) -> InstructionSet {
         match self {
             Self::Single(set) => set,
@@ -252,12 +252,12 @@ impl Products {
         }
     }
 
-    /// [`Simd::FACTORS`].
+    /// Factors in a word, as [`Simd::FACTORS`].
     pub(crate) fn factors(self) -> usize {
         if matches!(self, Self::Single(_)) { 1 } else { 2 }
     }
 
-    /// [`Simd::INTEGERS`].
+    /// Whether factors are integers, as [`Simd::INTEGERS`].
     pub(crate) fn integers(self) -> bool {
         match self {
             #[cfg(target_arch = "x86_64")]
@@ -279,7 +279,7 @@ impl Products {
         };
     }
 
-    /// A word's factors.
+    /// The factors in a word, first channel first.
     #[cfg(test)]
     pub(crate) fn factors_of(self, word: f32) -> Vec<f32> {
         let value = |half: u16| {

@@ -59,7 +59,7 @@ const OLDEST: TimeNs = TimeNs(60_000_000_000);
 pub struct ClockModel {
     /// Of samples and readings.
     line: Line,
-    /// Of samples alone.
+    /// Of the samples alone, without readings.
     samples: Line,
     strays: Option<Strays>,
     /// The latest device time that fitted, and what it was mapped to.

@@ -5,7 +5,7 @@ use crate::SampleEye;
 /// What a sequence of running numbers says about lost lines.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct SequenceTracker {
-    /// The newest number.
+    /// The newest number that has come.
     last: Option<u64>,
     /// The numbers that have come of each eye: bit 0 is the newest one, bit 1 the one right before it.
     came: [u128; 3],

@@ -22,7 +22,7 @@ pub enum TrackerSpec {
         /// Bits a second; the profile's own where the spec names none.
         baud: Option<u32>,
     },
-    /// `hid[:VID:PID][,profile=NAME][,serial=TEXT]`
+    /// `hid[:VID:PID][,profile=NAME][,serial=TEXT]`: a device that sends HID reports
     Hid {
         /// USB vendor and product; the profile's own where the spec names none.
         ids: Option<UsbIds>,
@@ -33,11 +33,11 @@ pub enum TrackerSpec {
     },
     /// `tcp:HOST[:PORT],profile=NAME`: the profile's port where there is none
     Tcp {
-        /// Host and port.
+        /// The tracker's host and port.
         address: HostPort,
         profile: String,
     },
-    /// `udp:HOST[:PORT],profile=NAME`: listens there
+    /// `udp:HOST[:PORT],profile=NAME`: listens there for datagrams
     Udp {
         /// Address of this machine and port.
         address: HostPort,
@@ -55,7 +55,7 @@ pub enum TrackerSpec {
         /// Begin again at its end.
         repeat: bool,
     },
-    /// `mock[:SCENARIO]`
+    /// `mock[:SCENARIO]`: a simulated eye
     Mock(Scenario),
     /// `mock:FILE`: the text of a [`Script`](crate::Script)
     MockFile(PathBuf),

@@ -41,7 +41,7 @@ impl Rig {
         Self { rig: calibration::Rig::default() }
     }
 
-    /// The bench's name.
+    /// The bench's name, for logs and reports.
     #[getter]
     fn name(&self) -> &str {
         &self.rig.name

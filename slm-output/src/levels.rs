@@ -94,7 +94,7 @@ pub enum LevelsError {
     )]
     Flatness {
         colour: Colour,
-        /// Finite values found.
+        /// Values of the table that are finite.
         found: usize,
         /// Pixels of the panel.
         expected: usize,

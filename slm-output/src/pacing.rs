@@ -91,7 +91,7 @@ struct Slot {
     frame_id: u64,
     t_wake: TimeNs,
     t_desired_present: TimeNs,
-    /// What was planned.
+    /// From submission to refresh, as it was planned.
     lead: TimeNs,
     t_submit: Option<TimeNs>,
     reported: bool,

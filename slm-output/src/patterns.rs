@@ -92,7 +92,7 @@ pub enum Pattern {
     },
     /// Bright lines on black that cross at the optical axis, with a square in the upper right quarter.
     CrossHair {
-        /// A line's width.
+        /// The width of a line, pixels.
         line_px: usize,
     },
     /// A blaze of another direction in each colour's field: red to the right, green up, blue to the left, with periods

@@ -527,7 +527,7 @@ fn milliseconds(TimeNs(ns): TimeNs) -> f64 {
     ns as f64 / 1e6
 }
 
-/// To three decimals.
+/// A figure rounded to three decimals.
 fn rounded(figure: f64) -> f64 {
     (figure * 1e3).round() / 1e3
 }

@@ -32,7 +32,7 @@ impl Span {
         Self { slips, ..self }
     }
 
-    /// Takes infinity, too.
+    /// Takes infinity, too, as a number or as the text "inf".
     pub(super) const fn or_infinite(self) -> Self {
         Self { or_infinite: true, ..self }
     }

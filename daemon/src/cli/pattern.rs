@@ -16,26 +16,26 @@ use super::RigArgs;
 pub enum PatternKind<To: Args> {
     /// One level everywhere, as it is: without look-up table and flatness.
     Level {
-        /// The level.
+        /// The level, from 0 to the panel's top one: 255 where it has 8 bits.
         #[arg(value_name = "LEVEL")]
         level: u16,
-        /// Where to.
+        /// Where the pattern goes, and in which colours.
         #[command(flatten)]
         to: To,
     },
     /// Upright lines of two levels, as they are: without look-up table and flatness. The light in the first order tells
     /// the phase between the levels (`holod lut`).
     TwoLevels {
-        /// One level.
+        /// The level of the first line, from 0.
         #[arg(value_name = "LEVEL")]
         first: u16,
-        /// The other one.
+        /// The level of the next line, from 0.
         #[arg(value_name = "LEVEL")]
         second: u16,
         /// Pixels across one line of each.
         #[arg(long, value_name = "PX", default_value_t = 32)]
         period: usize,
-        /// Where to.
+        /// Where the pattern goes, and in which colours.
         #[command(flatten)]
         to: To,
     },
@@ -47,7 +47,7 @@ pub enum PatternKind<To: Args> {
         /// Difference of phase between the squares, in multiples of π.
         #[arg(long, value_name = "PI", default_value_t = 1.0)]
         depth: f64,
-        /// Where to.
+        /// Where the pattern goes, and in which colours.
         #[command(flatten)]
         to: To,
     },
@@ -59,13 +59,13 @@ pub enum PatternKind<To: Args> {
         /// Where the first order goes: 0 to the right, 90 up.
         #[arg(long, value_name = "DEGREES", default_value_t = 0.0, allow_negative_numbers = true)]
         angle: f64,
-        /// The lines' shape.
+        /// The shape of its lines: how the phase goes within a period.
         #[arg(long, value_enum, default_value_t = ProfileArg::Blazed)]
         profile: ProfileArg,
         /// Largest less smallest phase in multiples of π; what sends most light into the first order when left out.
         #[arg(long, value_name = "PI")]
         depth: Option<f64>,
-        /// Where to.
+        /// Where the pattern goes, and in which colours.
         #[command(flatten)]
         to: To,
     },
@@ -77,7 +77,7 @@ pub enum PatternKind<To: Args> {
         /// Its diameter; the largest that does not alias when left out.
         #[arg(long, value_name = "MM")]
         diameter: Option<f64>,
-        /// Where to.
+        /// Where the pattern goes, and in which colours.
         #[command(flatten)]
         to: To,
     },
@@ -87,19 +87,19 @@ pub enum PatternKind<To: Args> {
         /// Pixels from dot to dot.
         #[arg(long, value_name = "PX", default_value_t = 60)]
         spacing: usize,
-        /// A dot's diameter.
+        /// A dot's diameter in pixels.
         #[arg(long, value_name = "PX", default_value_t = 16)]
         dot: usize,
-        /// Where to.
+        /// Where the pattern goes, and in which colours.
         #[command(flatten)]
         to: To,
     },
     /// Bright lines on black that cross at the optical axis, with a square in the upper right quarter.
     CrossHair {
-        /// A line's width.
+        /// A line's width in pixels.
         #[arg(long, value_name = "PX", default_value_t = 6)]
         line: usize,
-        /// Where to.
+        /// Where the pattern goes, and in which colours.
         #[command(flatten)]
         to: To,
     },
@@ -109,7 +109,7 @@ pub enum PatternKind<To: Args> {
         /// when left out.
         #[arg(long, value_name = "MM")]
         radius: Option<f64>,
-        /// Where to.
+        /// Where the pattern goes, and in which colours.
         #[command(flatten)]
         to: To,
     },
@@ -206,9 +206,9 @@ pub struct PatternTarget {
 pub enum ProfileArg {
     /// Two phases, half a period each.
     Binary,
-    /// Rising evenly.
+    /// A phase that rises evenly over the period.
     Blazed,
-    /// A sine.
+    /// A phase that follows a sine.
     Sinusoidal,
 }
 

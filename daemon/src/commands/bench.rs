@@ -86,7 +86,6 @@ struct ClosedLoop {
     sample_to_photon: Option<Spread>,
 }
 
-/// What was measured.
 struct Laps {
     renderer: String,
     ceilings: Option<Ceilings>,
@@ -110,7 +109,7 @@ struct FeedReport {
     memcpy: Quartiles,
     take: Quartiles,
     make: Quartiles,
-    /// Of medians.
+    /// The ratio of the two medians.
     take_of_memcpy: f64,
     make_of_memcpy: f64,
 }

@@ -35,11 +35,11 @@ struct Report {
     amplitude_constant: f32,
     /// Of colours that are lit.
     clipped_share: f32,
-    /// Of all images.
+    /// Pixels of all images together.
     colour_clipped_px: usize,
     /// Those of them that were brighter than white.
     colour_above_white_px: usize,
-    /// Of each image.
+    /// Pixels of each image that the picture does not reach.
     padded_px: usize,
     /// How the hologram was computed.
     engine: String,

@@ -45,10 +45,10 @@ pub enum Request {
     Scene {
         /// As after `--scene`, with absolute paths; `feed` for the live feed.
         scene: String,
-        /// As after `--depth-encoding`.
+        /// What the depth file's numbers are, as after `--depth-encoding`.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         depth_encoding: Option<String>,
-        /// As after `--fit`.
+        /// How another size is brought to the hologram's, as after `--fit`.
         #[serde(default)]
         fit: Fit,
     },

@@ -104,7 +104,6 @@ impl ControlServer {
         self.waiting.refused.map()
     }
 
-    /// Where it listens.
     pub(crate) fn socket(&self) -> &Path {
         self.place.path()
     }

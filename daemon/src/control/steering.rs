@@ -10,7 +10,7 @@ pub(crate) struct Steering {
     paused: AtomicBool,
     /// Bits of millimetres; 0 where the tracker is followed.
     fixed_pupil: AtomicU32,
-    /// Bits of millimetres.
+    /// Bits of an `f32` of millimetres.
     pupil_step: AtomicU32,
 }
 

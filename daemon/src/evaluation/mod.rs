@@ -39,7 +39,7 @@ const HIGHEST_PSNR_DB: f64 = 120.0;
 pub struct Judge {
     geometry: DisplayGeometry,
     light: PerColour<f32>,
-    /// Those with light.
+    /// The colours that the rig lights.
     colours: Vec<Colour>,
     amplitude_constant: f32,
     border_px: usize,

@@ -111,7 +111,6 @@ impl PageServer {
         Ok(Self { place, socket, live, runtime: Some(runtime) })
     }
 
-    /// Where it is.
     pub(super) fn place(&self) -> &PageAddress {
         &self.place
     }

@@ -124,7 +124,6 @@ impl RecordFolder {
         self.place.path()
     }
 
-    /// The folder itself.
     pub(super) fn place(&self) -> Arc<Place> {
         Arc::clone(&self.place)
     }

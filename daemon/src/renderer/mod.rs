@@ -29,7 +29,7 @@ pub enum Use {
     Command,
     /// The frames of a run. Once `stop` is set nothing more is waited for.
     Loop {
-        /// The run ends.
+        /// Set when the run is to end.
         stop: Arc<AtomicBool>,
     },
 }

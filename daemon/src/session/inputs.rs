@@ -25,7 +25,7 @@ pub(super) enum Inputs {
     Recorded(Playback),
 }
 
-/// What is followed.
+/// What frames are made of: the pupil and the pictures, as a person steers them.
 pub(super) struct Followed {
     /// The tracker's newest estimate.
     pub(super) pupil: EstimateReader,
@@ -213,7 +213,6 @@ impl TrainedPupils {
         Self { narrowest, widest }
     }
 
-    /// Their two ends.
     pub(super) fn ends(self) -> [PupilDiameter; 2] {
         [self.narrowest, self.widest]
     }

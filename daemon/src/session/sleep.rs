@@ -28,7 +28,7 @@ const RETRY_AFTER: Duration = Duration::from_secs(5);
 const ANSWER_WITHIN: Duration = Duration::from_secs(5);
 /// A machine that is still awake so long after it was about to sleep will not.
 const SLEEPS_WITHIN: Duration = Duration::from_secs(60);
-/// logind's property.
+/// The property of logind that is true from before the machine sleeps until it is awake.
 const PREPARING: &str = "PreparingForSleep";
 
 /// The control thread's view of the machine's sleep.

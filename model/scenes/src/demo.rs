@@ -176,7 +176,6 @@ fn far_card(stage: &Stage) -> Surface {
     })
 }
 
-/// A striped ball.
 fn ball(stage: &Stage, (cx, cy): (f32, f32), radius: f32, depth: f32) -> Surface {
     let (cx, cy, radius) = (cx * stage.half_width, cy * stage.half_height, radius * stage.unit);
     let shape = Shape::Ellipsoid { cx, cy, depth, rx: radius, ry: radius, rd: 0.12 };

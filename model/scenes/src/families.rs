@@ -193,7 +193,7 @@ pub(super) fn marks(random: &mut Random, kind: SceneKind) -> Pattern {
     }
 }
 
-/// A random reflectance.
+/// A random reflectance, of which a third is grey or nearly so.
 pub(super) fn colour(random: &mut Random, brightness: f32) -> Rgb {
     let grey = random.chance(0.35);
     let saturation = if grey { random.between(0.0, 0.12) } else { random.between(0.2, 0.95) };

@@ -39,7 +39,6 @@ impl GpuTracer {
         Ok(Self { gpu, draw, add })
     }
 
-    /// The device's name.
     pub(super) fn name(&self) -> &str {
         self.gpu.name()
     }
@@ -170,7 +169,7 @@ fn hierarchy(triangles: &mut [Triangle]) -> Vec<Node> {
     nodes
 }
 
-/// Some planes' sums.
+/// The sums of as many planes as a buffer takes.
 struct Planes {
     count: usize,
     first: wgpu::Buffer,

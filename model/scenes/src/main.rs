@@ -48,7 +48,7 @@ struct Generate {
     /// With the kind and the index, says which scene it is.
     #[arg(long)]
     seed: u64,
-    /// Number of scenes.
+    /// Number of scenes to generate.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     count: u64,
     /// Index of the first scene.
@@ -63,7 +63,7 @@ struct Generate {
 
 #[derive(Clone, Copy, ValueEnum)]
 enum Backend {
-    /// The processor's cores.
+    /// All cores of the processor.
     Cpu,
     /// The best graphics processor that Vulkan shows (in a build with `--features gpu`).
     Gpu,
@@ -140,7 +140,7 @@ fn bench_of(rig: Option<&Path>) -> Result<DisplayGeometry, RigError> {
 
 #[derive(Clone, Copy, ValueEnum)]
 enum Kind {
-    /// For training.
+    /// Scenes for training a network.
     Train,
     /// For testing, with textures that no training scene has.
     Test,
@@ -152,7 +152,7 @@ enum Kind {
 
 #[derive(Args)]
 struct Sheet {
-    /// Folder of scenes.
+    /// Folder of scenes, as `generate` writes them.
     folder: PathBuf,
     /// PNG file to write.
     #[arg(long, value_parser = png)]
@@ -191,7 +191,7 @@ struct Bench {
 
 #[derive(Args)]
 struct Measure {
-    /// Scenes to render.
+    /// How many scenes to render.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=1000))]
     scenes: u64,
     #[command(flatten)]

@@ -12,7 +12,7 @@ impl Random {
         Self(Pcg32::new(mix(seed), mix(stream ^ 0x9e37_79b9)))
     }
 
-    /// Uniform in 0..1.
+    /// Uniform from 0 to below 1.
     pub(super) fn unit(&mut self) -> f32 {
         (self.0.next_u32() >> 8) as f32 / 16_777_216.0
     }
@@ -26,7 +26,7 @@ impl Random {
         low * (high / low).powf(self.unit())
     }
 
-    /// Uniform in 0..count.
+    /// Uniform from 0 to below `count`.
     pub(super) fn below(&mut self, count: u32) -> u32 {
         ((u64::from(self.0.next_u32()) * u64::from(count)) >> 32) as u32
     }

@@ -73,7 +73,7 @@ impl PupilPlan {
         })
     }
 
-    /// The narrowest, likewise.
+    /// The narrowest pupil that any scene has on a bench.
     fn narrowest(&self, bench: &DisplayGeometry) -> PupilDiameter {
         PupilDiameter::from_mm(match self {
             Self::Fixed(pupils) => pupils.iter().map(|pupil| pupil.mm()).fold(f32::INFINITY, f32::min),

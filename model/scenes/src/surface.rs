@@ -41,7 +41,6 @@ pub(super) struct Vertex {
     pub(super) v: f32,
 }
 
-/// Triangles between vertices.
 #[derive(Clone)]
 pub(super) struct Mesh {
     pub(super) vertices: Vec<Vertex>,
@@ -158,7 +157,7 @@ impl Surface {
         }
     }
 
-    /// Multiplies every colour.
+    /// Multiplies every colour by `gain`, up to 1.
     pub(super) fn scale_light(&mut self, gain: f32) {
         for texel in &mut self.texels {
             (0..3).for_each(|c| texel[c] = (texel[c] * gain).min(1.0));

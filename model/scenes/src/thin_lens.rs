@@ -121,7 +121,7 @@ pub(super) fn focal_stacks<A: Adder>(
 
 /// What the views of all rings have in common.
 pub(super) struct Lens<'a> {
-    /// Nearest first.
+    /// From the nearest to the farthest.
     pub(super) surfaces: Vec<&'a Surface>,
     pub(super) resolution: Resolution,
     focus: Vec<f32>,
@@ -149,7 +149,6 @@ impl<'a> Lens<'a> {
         self.focus.iter().map(|focus| focus - self.middle)
     }
 
-    /// The planes' number.
     pub(super) fn planes(&self) -> usize {
         self.focus.len()
     }

@@ -24,7 +24,7 @@ impl Aim {
 /// Colour and depth of the nearest surface along each ray; black at minus infinity where there is none.
 pub(super) struct View {
     pub(super) grid: Grid,
-    /// [rows, columns], dioptres.
+    /// Depths in dioptres, [rows, columns].
     pub(super) depth: Vec<f32>,
     /// [rows, columns] each: red, green, blue.
     pub(super) colours: [Vec<f32>; 3],

@@ -24,10 +24,10 @@ use serde::Serialize;
 #[derive(Parser)]
 #[command(version)]
 struct Cli {
-    /// Only this card.
+    /// Compile for this card alone.
     #[arg(long, value_enum)]
     card: Option<CardName>,
-    /// Only this network.
+    /// Compile the shaders of this network alone.
     #[arg(long, value_enum)]
     network: Option<Network>,
     /// Only frames of this size; 512x512, 1920x1080 and 3840x2160 otherwise.
@@ -94,7 +94,7 @@ fn parse_resolution(text: &str) -> Result<Resolution, String> {
     Ok(Resolution { width: length(width)?, height: length(height)? })
 }
 
-/// sysexits(3).
+/// Exit codes as in sysexits(3).
 mod exit {
     pub(super) const USAGE: u8 = 64;
     pub(super) const UNAVAILABLE: u8 = 69;

@@ -13,7 +13,7 @@ const LARGEST_ARGUMENT: f64 = 4096.0;
 
 /// 2·J1(x)/x as a table, for every blur between layers of one bench that a pupil may make.
 pub(super) struct DiscTable {
-    /// At x·DENSITY.
+    /// The value at `x` is the entry `x * DENSITY`.
     pub(super) values: Vec<f32>,
     /// Entries to a millimetre of pupil, for the blur of a layer's neighbour at a cycle a sample.
     pub(super) entries_per_mm: f64,

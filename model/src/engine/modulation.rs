@@ -21,7 +21,7 @@ pub(super) struct Modulation {
 pub(super) struct OffsetParameters<'a> {
     /// [18, in, 3, 3]
     pub(super) weight: &'a [f32],
-    /// [18]
+    /// Of each offset, [18].
     pub(super) bias: &'a [f32],
 }
 

@@ -36,7 +36,7 @@ impl Map {
         Self { channels, width, height, values }
     }
 
-    /// Zero outside.
+    /// The value at a place of the map, and 0 outside it.
     pub(crate) fn at(&self, channel: usize, y: isize, x: isize) -> f64 {
         if y < 0 || x < 0 || y >= self.height as isize || x >= self.width as isize {
             return 0.0;

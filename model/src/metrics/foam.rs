@@ -100,7 +100,7 @@ impl AddAssign for Foam {
     }
 }
 
-/// Values [height, width].
+/// A value for each pixel, [height, width].
 struct Grid<T> {
     size: Resolution,
     values: Vec<T>,

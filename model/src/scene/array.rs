@@ -11,18 +11,18 @@ use crate::picture::srgb_to_linear;
 pub enum ArrayColours<'a> {
     /// sRGB of 8 bits.
     Srgb8(&'a [u8]),
-    /// sRGB, 0..=1.
+    /// sRGB, from 0 to 1.
     SrgbF32(&'a [f32]),
-    /// Linear light, 0..=1.
+    /// Linear light, from 0 to 1.
     LinearF32(&'a [f32]),
 }
 
 /// Depths of a picture, [height, width].
 #[derive(Clone, Copy, Debug)]
 pub enum ArrayDepths<'a> {
-    /// Metres above 0.
+    /// Metres, all above 0.
     MetresF32(&'a [f32]),
-    /// Millimetres above 0.
+    /// Millimetres, all above 0.
     MillimetresF32(&'a [f32]),
     /// Millimetres; 0 is no depth.
     MillimetresU16(&'a [u16]),
@@ -74,7 +74,7 @@ pub enum ArrayError {
     )]
     Missing {
         count: usize,
-        /// Of how many.
+        /// Pixels of the whole picture.
         pixels: usize,
         /// The first of them.
         found: f32,

@@ -28,7 +28,7 @@ pub(super) struct ColourRaster {
     pub(super) has_foreign_primaries: bool,
 }
 
-/// A depth picture.
+/// A picture of depths, in its file's own numbers.
 pub(super) struct DepthRaster {
     pub(super) size: Resolution,
     /// How it was turned after it was read.

@@ -99,7 +99,7 @@ impl FilePattern {
     }
 }
 
-/// `scene.toml`.
+/// The keys of a `scene.toml`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SceneFile {

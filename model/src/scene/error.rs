@@ -32,7 +32,7 @@ pub enum SceneError {
     #[error("{path}, line {line}: `{key}`: found {found}; expected {expected}", path = path.display())]
     Description {
         path: PathBuf,
-        /// Line, from 1.
+        /// Line of the file, from 1.
         line: usize,
         key: String,
         found: String,
@@ -51,7 +51,7 @@ pub enum SceneError {
     )]
     EncodingsDiffer {
         path: PathBuf,
-        /// Line, from 1.
+        /// Line of the file, from 1.
         line: usize,
         /// What the file says.
         own: DepthEncoding,

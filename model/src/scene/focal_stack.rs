@@ -55,7 +55,7 @@ pub struct FocalStackReport {
     pub has_foreign_primaries: bool,
 }
 
-/// `stack.toml`.
+/// The keys of a `stack.toml`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct StackFile {

@@ -367,7 +367,7 @@ fn clamped(depths: impl Iterator<Item = f32>, report: &mut FrameReport) -> Vec<f
     depths
 }
 
-/// [`clamped`] in place.
+/// What [`clamped`] does, in place.
 fn clamp(depths: &mut [f32], report: &mut FrameReport) {
     let [mut least, mut greatest] = [f32::MAX, f32::MIN];
     for depth in depths {

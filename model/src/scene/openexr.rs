@@ -17,7 +17,7 @@ use super::decoded::{ColourRaster, DepthRaster, FORMATS, MOST_PIXELS, check_size
 use super::depth::DepthNumbers;
 use super::{ClippedColours, SceneError, clipped, primaries};
 
-/// A decoded file.
+/// An OpenEXR file's channels, as they were decoded.
 struct Picture {
     size: Resolution,
     /// Position of the display window's first pixel.

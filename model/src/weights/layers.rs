@@ -97,14 +97,14 @@ pub(super) struct LayerShape {
     pub(super) modulation_hidden: Option<usize>,
 }
 
-/// One 3x3 layer.
+/// One layer of 3x3 convolutions.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Layer {
     pub(crate) out_channels: usize,
     pub(crate) in_channels: usize,
     /// [out, in, 3, 3]
     pub(crate) weight: Vec<f32>,
-    /// [out]
+    /// Of each output channel, [out].
     pub(crate) bias: Vec<f32>,
     pub(crate) adjustable: Option<Adjustable>,
 }
@@ -114,7 +114,7 @@ pub(crate) struct Layer {
 pub(crate) struct Adjustable {
     /// W0, [18, in, 3, 3]
     pub(crate) offset_weight: Vec<f32>,
-    /// b0, [18]
+    /// b0, of each offset, [18].
     pub(crate) offset_bias: Vec<f32>,
     /// g_m: 2 → hidden → hidden → 18·in + 18
     pub(crate) modulation: [Dense; 3],
@@ -124,8 +124,8 @@ pub(crate) struct Adjustable {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Dense {
     pub(crate) inputs: usize,
-    /// [outputs, inputs]
+    /// Of each input in each output, [outputs, inputs].
     pub(crate) weight: Vec<f32>,
-    /// [outputs]
+    /// Of each output, [outputs].
     pub(crate) bias: Vec<f32>,
 }

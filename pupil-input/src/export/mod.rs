@@ -34,7 +34,7 @@ pub enum ExportError {
     )]
     NoScale {
         path: PathBuf,
-        /// The recording's unit.
+        /// The unit of the recording's sizes.
         unit: &'static str,
     },
     /// The scale is no factor.

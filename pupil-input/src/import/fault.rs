@@ -45,7 +45,7 @@ pub enum ReplayError {
         path: PathBuf,
         /// Times that go backwards.
         backwards: u64,
-        /// Times in all.
+        /// All times of the log.
         rows: u64,
         /// Line of the first.
         line: u64,

@@ -340,7 +340,7 @@ struct BlinkFinder {
     silence_ns: i64,
     /// Of runs with a sign: a slow tracker may see a blink in one sample.
     shortest_shut_ns: i64,
-    /// Of good samples.
+    /// Of the diameters of good samples, over the last 100 ms or so.
     average: Option<f32>,
     latest_ns: Option<i64>,
     latest_good_ns: Option<i64>,

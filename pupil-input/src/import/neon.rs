@@ -125,7 +125,7 @@ const RECORD_FLOATS: [usize; 2] = [20, 14];
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Layout {
     floats: usize,
-    /// Left, right.
+    /// Of the left eye and of the right one.
     diameters: [Option<usize>; 2],
     apertures: [Option<usize>; 2],
 }

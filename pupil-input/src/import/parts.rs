@@ -19,7 +19,7 @@ pub(super) struct Parts {
 struct Part {
     /// Added to its times as they are written.
     shift_ns: i64,
-    /// Where it begins.
+    /// The line in which it begins, from 1.
     line: u64,
 }
 

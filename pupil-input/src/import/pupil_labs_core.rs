@@ -18,7 +18,7 @@ use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Core, recognises, read };
 
-/// Newest names first.
+/// Columns by their newest names first.
 const TIME: [&str; 2] = ["pupil_timestamp", "timestamp"];
 const EYE: [&str; 2] = ["eye_id", "id"];
 
@@ -36,7 +36,7 @@ fn is_header(line: &[u8]) -> bool {
 /// What made a row, in the order of trust.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Method {
-    /// Camera pixels.
+    /// Pixels of the camera.
     TwoD,
     /// Millimetres, by the model as it was while recording.
     LiveModel,
@@ -75,7 +75,7 @@ struct Row<'l> {
     eye: SampleEye,
     confidence: &'l [u8],
     method: Method,
-    /// The method's.
+    /// The cell of the diameter that the method makes.
     diameter: &'l [u8],
 }
 

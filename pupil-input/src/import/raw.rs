@@ -166,7 +166,7 @@ impl RawLog {
         Ok(Self { path: path.into(), profile, datagrams, span, recorded_scale, flaws })
     }
 
-    /// From its beginning.
+    /// Reads the recording from its beginning.
     pub(crate) fn records(&self) -> Result<RawReader<BufReader<File>>, ReplayError> {
         reader(&self.path)
     }

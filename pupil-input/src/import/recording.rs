@@ -306,7 +306,7 @@ impl LogBuilder {
         Ok(Recording { format, unit, rows, blinks, faults, stated_rate_hz, recorded_scale, notes: all, warned })
     }
 
-    /// Notes the parts.
+    /// Warns of where the clock began anew.
     fn end_parts(&mut self) {
         let mut restarts = LineList::default();
         self.parts.restarts().for_each(|line| restarts.take(line));

@@ -21,7 +21,6 @@ impl Measure {
         }
     }
 
-    /// Several of it.
     pub(super) const fn plural(self) -> &'static str {
         match self {
             Self::Diameter => "diameters",

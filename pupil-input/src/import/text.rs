@@ -28,7 +28,7 @@ pub(crate) struct Lines {
 /// One line, without its ending.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Line<'l> {
-    /// From 1.
+    /// The line's number in the file, from 1.
     pub(crate) number: u64,
     pub(crate) bytes: &'l [u8],
 }

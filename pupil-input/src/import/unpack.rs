@@ -36,7 +36,7 @@ pub(super) fn plain(source: impl Read + 'static, shortened: &Shortened) -> io::R
 struct Archive<R: BufRead> {
     /// None at the end.
     member: Option<GzDecoder<R>>,
-    /// Something was unpacked.
+    /// Whether any byte has been unpacked: before that a cut is an error, afterwards a shorter log.
     unpacked: bool,
     shortened: Shortened,
 }

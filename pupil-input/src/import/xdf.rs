@@ -250,7 +250,7 @@ enum Channel {
         eye: SampleEye,
         measure: Measure,
         unit: Unit,
-        /// For people.
+        /// The channel's label as the log has it, for messages.
         label: String,
         /// Why it may be another measure.
         doubt: Option<&'static str>,

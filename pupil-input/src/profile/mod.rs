@@ -120,7 +120,7 @@ pub const DEFAULT_PROFILE: &str = "holod";
 /// Bits a second where neither spec nor profile names any.
 pub(crate) const DEFAULT_BAUD: u32 = 115_200;
 
-/// By name.
+/// The shipped profiles, sorted by their names.
 const FILES: [(&str, &str); 13] = [
     ("asl-eye-trac", include_str!("../../profiles/asl-eye-trac.toml")),
     ("core", include_str!("../../profiles/core.toml")),

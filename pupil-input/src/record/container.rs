@@ -242,9 +242,9 @@ pub(crate) enum HeaderFault {
 /// How a recording ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Ending {
-    /// As it should.
+    /// With the record of its end, and nothing behind it.
     Whole,
-    /// Between two records.
+    /// Between two records, without that of its end.
     CutOff,
     /// Within a record, with this many bytes from there to the end of the file, and no whole record in them.
     Torn { unread_bytes: u64 },
@@ -330,7 +330,7 @@ pub(crate) struct RawReader<R> {
 }
 
 impl<R: Read> RawReader<R> {
-    /// Reads the header.
+    /// Reads the header; records follow.
     pub(crate) fn new(mut input: R) -> Result<Self, HeaderFault> {
         let mut bytes = Vec::new();
         take(&mut input, 16, &mut bytes).map_err(HeaderFault::Io)?;
@@ -457,7 +457,7 @@ fn take(input: &mut impl Read, count: usize, out: &mut Vec<u8>) -> io::Result<()
     input.by_ref().take(count as u64).read_to_end(out).map(drop)
 }
 
-/// Appends a record.
+/// Appends a record with its check sum to `out`.
 pub(crate) fn encode_record(head: &RecordHead, payload: &[u8], out: &mut Vec<u8>) {
     let begins = out.len();
     out.extend(head.encode(payload.len()));

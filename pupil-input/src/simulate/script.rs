@@ -19,7 +19,7 @@ pub struct Script {
     pub(super) hippus_mm: f64,
     pub(super) noise_mm: f64,
     pub(super) grain_mm: f64,
-    /// 0..=1.
+    /// The share of samples that do not come, 0 to 1.
     pub(super) missing: f64,
     pub(super) confidence_told: bool,
     pub(super) aperture_mm: Option<f64>,
@@ -34,7 +34,6 @@ pub struct Script {
     pub(super) events: Vec<Event>,
 }
 
-/// Something that happens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Event {
     at_s: f64,
@@ -44,9 +43,9 @@ pub(super) struct Event {
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum What {
-    /// cd/m².
+    /// Luminance of what the viewer sees from then on, cd/m².
     Light(f64),
-    /// Settled diameter, mm.
+    /// The light from then on is that at which the pupil settles at this diameter, millimetres.
     Pupil(f64),
     Blink {
         lasts_s: f64,
@@ -74,7 +73,7 @@ pub(super) enum What {
         by_mm: f64,
         lasts_s: f64,
     },
-    /// Seconds.
+    /// Steps of the clock by this many seconds each.
     Steps(f64),
 }
 

@@ -28,7 +28,7 @@ pub(crate) const LONGEST_READ: usize = 1 << 16;
 pub(crate) enum ReadEvent {
     /// This many bytes: a piece of the stream, or one whole message of a link that has messages.
     Bytes(usize),
-    /// Nothing within [`READ_TIMEOUT`].
+    /// Nothing came within [`READ_TIMEOUT`].
     Silence,
     /// A message of a sender that is not followed.
     Stranger,

@@ -18,14 +18,14 @@ pub enum NetworkError {
     /// The host's name is not known.
     #[error("tracker {address}: the host `{}` is not found: {reason}; check its name, or give its address in numbers", address.host)]
     Host {
-        /// Host and port.
+        /// The tracker's host and port.
         address: HostPort,
         reason: String,
     },
     /// No connection came about.
     #[error("tracker {address} does not accept a connection: {reason}; {hint}")]
     Connect {
-        /// Host and port.
+        /// The tracker's host and port.
         address: HostPort,
         reason: io::Error,
         hint: &'static str,
@@ -41,7 +41,7 @@ pub enum NetworkError {
     /// The tracker does not do as it is told.
     #[error("tracker {address}, profile `{profile}`: {problem}; check the profile and the tracker's settings")]
     Command {
-        /// Host and port.
+        /// The tracker's host and port.
         address: HostPort,
         profile: String,
         problem: Box<CommandError>,

@@ -387,7 +387,7 @@ impl Drop for FinishedAtEnd {
     }
 }
 
-/// Where decisions go.
+/// Where decisions go: to whoever looks at them, and into the recording.
 struct Tap<'a> {
     tap: &'a mut rtrb::Producer<Decision>,
     record: &'a mut Option<Taps>,

@@ -41,7 +41,7 @@ impl Buffer {
 #[derive(Clone, Debug)]
 pub(super) struct Beginning {
     buffer: Buffer,
-    /// It is longer.
+    /// Whether the text is longer than what the buffer takes.
     pub(super) overlong: bool,
 }
 

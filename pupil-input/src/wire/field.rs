@@ -28,7 +28,7 @@ pub struct Layout<P> {
 /// Where a message has its time, and how that is read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimeAt<P> {
-    /// Where it stands.
+    /// The place of the time in the message.
     pub at: P,
     /// Nanoseconds of one of its units: of a second, a microsecond, a frame.
     pub ns_per_tick: f64,
@@ -95,7 +95,7 @@ pub enum Validity {
 pub enum SizeKind {
     /// The diameter of the pupil.
     Diameter,
-    /// Half the diameter.
+    /// The radius, half the diameter.
     Radius,
     /// The area, which is taken for that of a disc.
     Area,
@@ -145,19 +145,19 @@ impl<P> PupilAt<P> {
 /// Type of a number in a binary message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NumberType {
-    /// One byte, unsigned.
+    /// One byte: 0 to 255.
     U8,
     /// One byte, two's complement.
     I8,
-    /// Two bytes, unsigned.
+    /// Two bytes: 0 to 65535.
     U16,
     /// Two bytes, two's complement.
     I16,
-    /// Four bytes, unsigned.
+    /// Four bytes: 0 to 2³² − 1.
     U32,
     /// Four bytes, two's complement.
     I32,
-    /// Eight bytes, unsigned.
+    /// Eight bytes: 0 to 2⁶⁴ − 1.
     U64,
     /// Four bytes, IEEE 754.
     F32,
@@ -262,7 +262,7 @@ pub(super) trait Message<P> {
     fn has_text(&self, at: &P, text: &[u8]) -> bool;
 }
 
-/// A binary message.
+/// The bytes of a binary message.
 pub(super) struct Bytes<'a>(pub(super) &'a [u8]);
 
 impl Message<Field> for Bytes<'_> {
@@ -364,7 +364,7 @@ impl Numbering {
     }
 }
 
-/// Messages to samples.
+/// Makes samples of messages by a layout, with what it remembers of earlier ones.
 #[derive(Clone, Debug)]
 pub(super) struct Fields<P> {
     layout: Layout<P>,

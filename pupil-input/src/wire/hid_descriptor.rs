@@ -218,7 +218,7 @@ pub enum DescriptorError {
         "the fields of usages {one} and {other} are in different reports; a sample must be in one: correct the profile's usages"
     )]
     OtherReport {
-        /// The first field.
+        /// The usage of the sample's first field.
         one: Usage,
         /// The field in another report.
         other: Usage,
@@ -229,7 +229,7 @@ pub enum DescriptorError {
     )]
     Unreadable {
         usage: Usage,
-        /// Its width.
+        /// The width of the field.
         bits: u32,
         bit_offset: u32,
     },

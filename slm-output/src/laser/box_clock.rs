@@ -19,7 +19,7 @@ pub struct BoxClock {
 
 #[derive(Clone, Copy, Debug)]
 struct Known {
-    /// Host time.
+    /// When it was learned, on the host's clock.
     t: TimeNs,
     least_ns: i64,
     greatest_ns: i64,

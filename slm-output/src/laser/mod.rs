@@ -168,7 +168,7 @@ pub enum LaserError {
     )]
     NotABox {
         path: String,
-        /// What it answered.
+        /// The line that it answered.
         found: String,
         /// How a box answers.
         expected: &'static str,
@@ -199,7 +199,7 @@ pub enum LaserError {
         limit: f64,
         /// What the rig asks for.
         asked: f64,
-        /// Of both.
+        /// Unit of both figures, such as mW.
         unit: &'static str,
     },
     /// A laser would be told more than the rig allows, so that its power gets to the panel.
@@ -237,7 +237,7 @@ pub enum LaserError {
         path: String,
         /// What it was told or asked.
         sent: String,
-        /// What it answered.
+        /// The line that it answered.
         found: String,
         /// What it should have answered.
         expected: String,

@@ -32,7 +32,6 @@ const DIGITAL_CONTROL: u16 = 7000;
 const LASER_ON: u16 = 7006;
 const POWER_PERCENT: u16 = 7013;
 
-/// One device.
 struct ReadyBeam {
     port: Conversation,
     sequence: u16,

@@ -124,7 +124,6 @@ pub(super) fn dark_request_parts(request: u64) -> (u64, Option<DarkReason>) {
     (request / NEXT, if has_wishes { Some(DarkReason::Asked) } else { reason_of(request as u8) })
 }
 
-/// One more.
 pub(super) fn count(counter: &AtomicU64) {
     counter.fetch_add(1, Ordering::Relaxed);
 }

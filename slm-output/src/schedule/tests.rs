@@ -18,7 +18,7 @@ const MS: i64 = 1_000_000;
 struct Step {
     /// The panel goes on with its old picture, and says nothing.
     dropped: bool,
-    /// It says nothing.
+    /// The panel refreshes as planned, and says nothing.
     silent: bool,
     /// The reported time is off by this.
     jitter_ns: i64,

@@ -30,7 +30,7 @@ pub(super) fn machine(rig: &Rig, service: bool, root: &Path) -> Vec<Check> {
     checks
 }
 
-/// Every other process.
+/// Every process but this one.
 fn others(root: &Path) -> Vec<Process> {
     let numbers = names(&root.join("proc"), "").into_iter().filter_map(|name| name.parse::<u32>().ok());
     let others = numbers.filter(|pid| *pid != std::process::id());

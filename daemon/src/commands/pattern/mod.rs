@@ -24,7 +24,7 @@ use crate::{results, setup};
 struct Report<'a> {
     #[serde(flatten)]
     sight: &'a Sight,
-    /// Nothing without `--output`.
+    /// What was shown on a panel; none without `--output`.
     shown: Option<&'a Shown>,
 }
 

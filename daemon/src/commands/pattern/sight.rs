@@ -21,12 +21,11 @@ const CAMERA_DPT: RangeInclusive<f64> = 0.0..=10.0;
 pub(super) struct Sight {
     /// The pattern in words.
     pattern: String,
-    /// The rig's name.
     rig: String,
     /// The files that were written.
     #[serde(serialize_with = "crate::results::paths_text")]
     pub(super) files: Vec<PathBuf>,
-    /// Where light goes.
+    /// Where light falls in the eyepiece's focal plane, spot by spot.
     spots: Vec<Spot>,
     /// What else there is to know.
     notes: Vec<String>,

@@ -41,7 +41,7 @@ pub(super) struct Quantiles {
 }
 
 impl Quantiles {
-    /// None of nothing.
+    /// None where there are no values.
     fn of(values: Vec<f64>) -> Option<Self> {
         let sorted = Sorted::new(values)?;
         let [p1, median, p99, max] = [0.01, 0.5, 0.99, 1.0].map(|share| sorted.quantile(share));

@@ -82,7 +82,7 @@ impl From<Errno> for Gone {
 pub(super) struct Client {
     pub(super) socket: OwnedFd,
     pub(super) name: String,
-    /// When it came.
+    /// When it connected; it has a while to say what it sends.
     t_came: TimeNs,
     /// When a picture of it was taken over last; long ago where none was.
     pub(super) t_last: TimeNs,
@@ -145,7 +145,7 @@ pub(super) struct Copied {
 }
 
 impl Copied {
-    /// Colours and depths.
+    /// The bytes of the colours, and behind them those of the depths.
     fn parts(&self) -> (&[u8], &[u8]) {
         self.bytes.split_at(self.colour_bytes)
     }

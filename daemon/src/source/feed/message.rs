@@ -196,12 +196,12 @@ impl Layout {
         }
     }
 
-    /// All slots.
+    /// Bytes of all slots together.
     pub(super) const fn bytes(&self) -> usize {
         SLOTS * self.slot_bytes
     }
 
-    /// `RING`.
+    /// The message `RING`: slots, and the places of colours and depths within one.
     pub(super) fn ring(&self) -> [u8; 48] {
         let mut bytes = [0; 48];
         bytes[..4].copy_from_slice(b"RING");
@@ -227,7 +227,7 @@ pub(super) enum Outcome {
     NotShown,
 }
 
-/// `FREE`.
+/// The message `FREE`: what became of the picture in a slot, with the reason where it was refused.
 pub(super) fn free(slot: u32, sequence: u64, outcome: &Outcome) -> Vec<u8> {
     let (code, text) = match outcome {
         Outcome::Taken => (0_u32, ""),
@@ -239,7 +239,7 @@ pub(super) fn free(slot: u32, sequence: u64, outcome: &Outcome) -> Vec<u8> {
     [b"FREE", numbers.as_slice(), text.as_bytes()].concat()
 }
 
-/// `NOPE`.
+/// The message `NOPE`: why the client is not served.
 pub(super) fn nope(why: &str) -> Vec<u8> {
     [b"NOPE", why.as_bytes()].concat()
 }

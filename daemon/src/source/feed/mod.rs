@@ -304,7 +304,7 @@ impl Drop for Feed {
     }
 }
 
-/// The feed's thread.
+/// What runs in the feed's own thread.
 struct Server {
     listener: OwnedFd,
     place: Arc<SocketPlace>,

@@ -6,7 +6,7 @@ use crate::weights::Grid;
 
 /// Panel pixels to a sample of the half-band grid, each way.
 pub(super) const SCALE: usize = scale_of(Grid::HalfBand);
-/// All of them.
+/// Panel pixels to a sample, both ways.
 pub(super) const PIXELS_PER_SAMPLE: usize = SCALE * SCALE;
 
 /// Panel pixels to a sample of `grid`, each way.

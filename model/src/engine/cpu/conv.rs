@@ -25,9 +25,9 @@ const ROW_PAD: usize = 16;
 /// What is done with a sum before it is stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Epilogue {
-    /// sum
+    /// The sum as it is.
     None,
-    /// leaky(sum)
+    /// leaky(sum), with the network's slope
     Leaky,
     /// leaky(½·sum + what the output map holds)
     ResidualLeaky,

@@ -31,7 +31,7 @@ struct Scratch {
 
 /// What it makes of [`ROWS`] pixels at a time.
 struct Pixels {
-    /// Where they read.
+    /// Where each of the pixels reads, at every tap.
     places: Vec<Places>,
     /// The panels of what they read at each tap, and those of their sums.
     taps: Vec<f32>,
@@ -119,7 +119,7 @@ impl Scratch {
     }
 }
 
-/// One row.
+/// One row of the output map, of all its channels.
 struct Row<'a> {
     shape: Shape,
     weights: &'a [f32],
@@ -130,7 +130,7 @@ struct Row<'a> {
     offsets_stride: usize,
     y: usize,
     pixels: &'a mut Pixels,
-    /// With its border.
+    /// The row of the output map, with the border at its ends.
     output_row: &'a mut [f32],
 }
 

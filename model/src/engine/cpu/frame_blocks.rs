@@ -37,7 +37,7 @@ impl FrameBlocks {
 /// The pixels behind a block of columns.
 struct Take<'a> {
     frame: &'a RgbdFrame,
-    /// The first column.
+    /// The block's first column, in samples of the grid.
     first: usize,
     /// [plane, pixel, row, column of the block]
     planes: &'a mut [f32],

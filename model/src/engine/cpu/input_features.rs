@@ -34,7 +34,7 @@ pub(super) struct InputChannels {
     /// likewise, and three colours of each plane of what is lacking. Nothing but zeros lies between what is told and
     /// this.
     pub(super) field: usize,
-    /// All of them.
+    /// The number of all channels.
     pub(super) count: usize,
 }
 

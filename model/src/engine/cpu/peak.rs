@@ -148,7 +148,7 @@ fn last_level_caches(cpus: &Path) -> Option<u64> {
     Some(caches.into_iter().map(|(.., bytes)| bytes).sum())
 }
 
-/// `32768K` in bytes.
+/// A size as sysfs writes it, such as `32768K`, in bytes.
 fn size_bytes(text: &str) -> Option<u64> {
     let digits = text.trim_end_matches(['K', 'M', 'G']);
     let shift = match &text[digits.len()..] {

@@ -138,7 +138,7 @@ struct Block<'a> {
     to: &'a mut [f32],
     /// Values of one plane in `to`.
     plane_len: usize,
-    /// [plane, cell]
+    /// The block's lines of each plane, [plane, cell].
     lines: &'a mut [f32],
     between: &'a mut [f32],
     scratch: &'a mut FftScratch,

@@ -119,7 +119,7 @@ impl PlaneNetwork<'_> {
 /// its phases, and carries all of it to the SLM plane.
 struct LightPlanes {
     bytes: u64,
-    /// The first net's.
+    /// The map of the first net's outputs.
     output: MapId,
     refines: bool,
 }
@@ -162,7 +162,7 @@ impl<V: View> Stage<PlaneStack<V>> for LightPlanes {
 /// Takes the first net's outputs in a block of columns.
 struct TakeOutputs<'a> {
     map: &'a FeatureMap,
-    /// The first column.
+    /// The block's first column, in samples of the grid.
     first: usize,
     /// [channel, row, column of the block]
     outputs: &'a mut [f32],

@@ -138,7 +138,7 @@ pub(super) const fn panel_place(row: usize, channel: usize) -> usize {
 struct Block {
     first: usize,
     channels: usize,
-    /// [`PAIR`] or 1.
+    /// Words that each step takes: [`PAIR`] or 1.
     words_together: usize,
 }
 

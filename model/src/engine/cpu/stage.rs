@@ -26,15 +26,15 @@ pub(super) trait Shared: Send + Sync {
 
 /// One step of a frame, with its parameters and what it alone needs to run.
 pub(super) trait Stage<F: Shared>: Send + Sync {
-    /// As in [`StageTiming`](crate::engine::StageTiming).
+    /// The stage's name, as in [`StageTiming`](crate::engine::StageTiming).
     fn name(&self) -> &str;
 
-    /// As in [`StageTiming`](crate::engine::StageTiming).
+    /// Floating-point operations of a frame, as in [`StageTiming`](crate::engine::StageTiming).
     fn flop(&self) -> u64 {
         0
     }
 
-    /// As in [`StageTiming`](crate::engine::StageTiming).
+    /// Bytes that a frame moves at least, as in [`StageTiming`](crate::engine::StageTiming).
     fn bytes(&self) -> u64;
 
     /// Does the step; allocates nothing.
@@ -82,7 +82,7 @@ pub(super) struct Maps {
     handed_on: Vec<(usize, [MapId; 2])>,
 }
 
-/// One of [`Maps`].
+/// The place of one of the [`Maps`].
 #[derive(Clone, Copy)]
 pub(super) struct MapId(usize);
 
@@ -96,7 +96,7 @@ impl Maps {
         self.products.set()
     }
 
-    /// A further map.
+    /// Makes a further map, of zeros.
     pub(super) fn add(&mut self, channels: usize) -> MapId {
         self.maps.push(FeatureMap::new(self.size.width, self.size.height, channels, self.set()));
         MapId(self.maps.len() - 1)

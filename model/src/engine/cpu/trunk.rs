@@ -55,7 +55,7 @@ impl Trunk {
     }
 }
 
-/// One layer.
+/// One layer of a net, from a map to another.
 pub(super) struct LayerStage {
     name: String,
     flop: u64,

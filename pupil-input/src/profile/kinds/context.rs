@@ -28,7 +28,7 @@ pub(in crate::profile) struct Context<'a> {
     pub(in crate::profile) counts_frames: Cell<bool>,
     pub(in crate::profile) size: SizeRule,
     pub(in crate::profile) unit: SizeUnit,
-    /// Where `[size]` is.
+    /// Where the file has its `[size]`; none without one.
     pub(in crate::profile) size_at: Option<Found<'a, ()>>,
 }
 

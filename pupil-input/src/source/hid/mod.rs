@@ -26,7 +26,7 @@ use crate::wire::hid_descriptor::DescriptorError;
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum HidError {
-    /// No device fits.
+    /// No HID device fits what is looked for.
     #[error(
         "no HID device is {wanted}; {found}; plug the tracker in, or correct the ids, the serial number or the profile"
     )]

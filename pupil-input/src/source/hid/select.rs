@@ -72,7 +72,7 @@ pub(super) fn either(ids: &[UsbIds]) -> String {
 /// What is looked for; what is None or empty may be anything.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Wanted {
-    /// One of these.
+    /// It has one of these, vendor and product.
     pub(crate) ids: Vec<UsbIds>,
     pub(crate) serial: Option<String>,
     pub(crate) usage_page: Option<u16>,

@@ -63,17 +63,17 @@ pub(super) struct Scanner {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
-    /// Between messages.
+    /// Between two messages, or before the first.
     Outside,
     /// In bytes of no message, up to a brace at the beginning of a line.
     Lost,
     /// Before a name, or the end of an empty object.
     Name,
-    /// Behind a name.
+    /// Behind a name, before its colon.
     Colon,
     /// Before a value, or the end of an empty array.
     Value,
-    /// Behind a value.
+    /// Behind a value, before a comma or the end of what it is in.
     Comma,
     /// In a string; what it is for, and whether the last byte was a backslash.
     Text { name: bool, escaped: bool },

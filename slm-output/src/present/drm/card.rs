@@ -24,7 +24,7 @@ use super::find::SeenConnector;
 use super::properties::{PipeProperties, Properties};
 use super::seat::{Seat, SeatLease};
 
-/// An open card.
+/// A graphics card whose node is open.
 #[derive(Debug)]
 pub(crate) struct Card {
     /// Given back before the file is closed.
@@ -71,12 +71,12 @@ impl Card {
         Ok(card)
     }
 
-    /// The card's node.
+    /// The path of the card's node, such as `/dev/dri/card0`.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Its driver's name.
+    /// The name of its driver, such as `amdgpu`.
     pub(crate) fn driver(&self) -> &str {
         &self.driver
     }

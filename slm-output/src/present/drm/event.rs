@@ -5,7 +5,7 @@ use holod_calibration::TimeNs;
 use super::timing::FlipStamp;
 
 const HEADER_BYTES: usize = 8;
-/// `struct drm_event_vblank`.
+/// Bytes of a `struct drm_event_vblank`.
 const FLIP_BYTES: usize = 32;
 
 /// Calls `flipped` with the controller (CRTC) and the stamp of each page flip in `bytes`, as read from a card. A

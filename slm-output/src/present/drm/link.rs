@@ -42,7 +42,7 @@ pub(crate) struct Wanted {
     pub(crate) channel_bits: u8,
 }
 
-/// An opened connector.
+/// An opened connector, with its card, mode and buffers.
 #[derive(Debug)]
 pub(crate) struct Link {
     card: Card,
@@ -249,7 +249,7 @@ pub(crate) enum Found {
     OtherMonitor,
 }
 
-/// Stamps of flips.
+/// The stamps of page flips that were read together.
 pub(crate) struct Flips {
     stamps: [FlipStamp; EVENTS_MAX],
     count: usize,

@@ -95,7 +95,7 @@ pub struct DrmPanel {
     lost: Option<PanelFault>,
 }
 
-/// One video frame.
+/// What one video frame shows.
 #[derive(Clone, Copy, Debug)]
 struct Picture {
     frame: Option<FrameTag>,

@@ -6,7 +6,7 @@ use holod_calibration::{Resolution, TimeNs};
 /// A mode's rate may be off the rig's by this part.
 const RATE_TOLERANCE: f64 = 1e-3;
 
-/// Refreshes a second.
+/// Refreshes a second; 0 of a mode that has no pixels.
 pub(crate) fn refresh_hz(mode: &Mode) -> f64 {
     let pixels = f64::from(mode.hsync().2) * f64::from(mode.vsync().2) * f64::from(mode.vscan().max(1));
     let half_frames = if mode.flags().contains(ModeFlags::INTERLACE) { 2.0 } else { 1.0 };

@@ -119,7 +119,7 @@ impl Drop for Seat {
 }
 
 impl SeatLease {
-    /// The seat's name.
+    /// The name of the seat, such as `seat0`.
     pub(crate) fn seat(&self) -> &str {
         &self.seat
     }

@@ -251,7 +251,7 @@ impl Answers {
         }
     }
 
-    /// It is `now`.
+    /// Gives up waiting for a time where `now` is too late for it.
     fn waited(&mut self, now: TimeNs) -> Option<Completion> {
         self.t_waited().filter(|t_waited| now >= *t_waited).and_then(|_| self.give_times_up())
     }
