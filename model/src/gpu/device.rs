@@ -15,6 +15,8 @@ pub struct Gpu {
     pub queue: GivenBack<wgpu::Queue>,
     name: String,
     fault: Arc<OnceLock<String>>,
+    /// The maker's number at PCI.
+    pub(crate) vendor: u32,
     /// The longest that any piece of work may take before the device counts as hung.
     pub(crate) patience: Duration,
     /// The most bytes that a shader can see as one buffer.
@@ -90,7 +92,7 @@ impl Gpu {
     /// # Errors
     /// Its driver refuses.
     pub(crate) fn on(adapter: &wgpu::Adapter, with_matrices: bool) -> Result<Self, GpuError> {
-        let name = adapter.get_info().name;
+        let wgpu::AdapterInfo { name, vendor, .. } = adapter.get_info();
         let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let half_precision = adapter.features() & wgpu::Features::SHADER_F16;
         let (matrix_units, experimental_features) = match with_matrices && has_matrix_units(adapter) {
@@ -131,6 +133,7 @@ impl Gpu {
             queue: GivenBack(Some(queue)),
             name,
             fault,
+            vendor,
             patience: PATIENCE,
             largest_buffer,
             workgroup_bytes,

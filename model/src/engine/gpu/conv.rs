@@ -1,14 +1,15 @@
 //! 3x3 convolutions on the GPU, as sums over taps.
 //!
 //! Layers that read matrices multiply these, in half precision, and sum up in single precision. Of the others those
-//! that read or write a map of half precision multiply in half precision, two products at once, and sum up what each
-//! group of input channels gives in single precision; the rest multiply in single precision.
+//! that read or write a map of half precision multiply in half precision, two products at once, and sum up what a few
+//! groups of input channels give in single precision; the rest multiply in single precision.
 
 use half::f16;
 
 use super::map::{Format, GROUP, Map, ROWS, TILE};
 use super::matrix::{self, TilePacking};
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan, Shader};
+use super::winograd;
 use crate::engine::Precision;
 
 pub(super) const TAPS: usize = 9;
@@ -16,17 +17,46 @@ pub(super) const TAPS: usize = 9;
 const WORKGROUP: usize = 64;
 /// Bytes of parameters that the shaders load at once.
 const ELEMENT_BYTES: usize = 64;
+/// Groups of input channels whose products are summed in half precision, at most.
+const MOST_TRIP_GROUPS: usize = 4;
 
-impl Precision {
-    /// Groups of output channels that a thread of a layer that multiplies so holds sums of, at most: with [`ROWS`] rows
-    /// of so many a shader has registers left for what it multiplies.
+/// How a layer that multiplies vectors makes its products.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Method {
+    /// Each input by each weight.
+    Direct,
+    /// Half as many, of sums of inputs by sums of weights ([`winograd`]).
+    Winograd,
+}
+
+impl Method {
+    /// Of layers in single precision, on a device of this maker's number at PCI. NVIDIA's devices load weights by the
+    /// way of all memory, and four products of one in a thread pay for it; those of others have a way of their own for
+    /// what all threads share, and one product is enough.
+    pub(crate) fn of_vendor(vendor: u32) -> Self {
+        const NVIDIA: u32 = 0x10de;
+        if vendor == NVIDIA { Self::Direct } else { Self::Winograd }
+    }
+
+    /// Groups of output channels that a thread holds sums of, at most: with so many a shader has registers left for
+    /// what it multiplies.
     fn most_part_groups(self) -> usize {
         match self {
-            Self::Single => 5,
-            Self::Half => 4,
+            Self::Direct => 5,
+            Self::Winograd => 2,
         }
     }
 
+    /// Weights for each column of the kernel.
+    fn column_weights(self) -> usize {
+        match self {
+            Self::Direct => 3,
+            Self::Winograd => winograd::POINTS,
+        }
+    }
+}
+
+impl Precision {
     /// Vectors of parameters in an element.
     pub(super) fn element_vectors(self) -> usize {
         ELEMENT_BYTES / (GROUP * self.bytes())
@@ -88,7 +118,7 @@ impl ConvLayer<'_> {
         constants
     }
 
-    /// `epilogue.wgsl` and `text` for the vectors of two maps.
+    /// `epilogue.wgsl`, `store.wgsl` and `text` for the vectors of two maps.
     pub(super) fn source(&self, input: &Map, output: &Map, text: &str) -> String {
         let epilogue = concat!(include_str!("epilogue.wgsl"), "\n", include_str!("store.wgsl"));
         let directive = if products(input, output) == Precision::Half { ENABLE_F16 } else { "" };
@@ -123,18 +153,18 @@ pub(crate) struct Packing {
 enum Layout {
     /// Threads make the output channels in parts of a few whole groups; those beyond the map's groups are zero and not
     /// stored.
-    Groups { input_groups: usize, parts: usize, part_groups: usize },
+    Groups { method: Method, input_groups: usize, parts: usize, part_groups: usize },
     /// Matrices, for each column of the kernel, block of inputs and row of the kernel.
     Tiles { input_blocks: usize, packing: TilePacking },
 }
 
 impl Packing {
-    /// For a layer that multiplies vectors in `precision`, reads the first `input_groups` of a map and writes a map of
-    /// `output_groups`.
-    pub(crate) fn new(precision: Precision, input_groups: usize, output_groups: usize) -> Self {
-        let parts = output_groups.div_ceil(precision.most_part_groups());
+    /// For a layer that multiplies vectors in `precision` by `method`, reads the first `input_groups` of a map and
+    /// writes a map of `output_groups`.
+    pub(crate) fn new(method: Method, precision: Precision, input_groups: usize, output_groups: usize) -> Self {
+        let parts = output_groups.div_ceil(method.most_part_groups());
         let part_groups = output_groups.div_ceil(parts);
-        Self { precision, layout: Layout::Groups { input_groups, parts, part_groups } }
+        Self { precision, layout: Layout::Groups { method, input_groups, parts, part_groups } }
     }
 
     /// For a layer that multiplies matrices, and reads the first `input_blocks` of a map.
@@ -146,8 +176,8 @@ impl Packing {
     /// Numbers in the buffer.
     pub(crate) fn len(&self) -> usize {
         match self.layout {
-            Layout::Groups { input_groups, parts, part_groups } => {
-                self.biases(parts * part_groups) + parts * input_groups * self.group_len(part_groups)
+            Layout::Groups { method, input_groups, parts, part_groups } => {
+                self.biases(parts * part_groups) + parts * input_groups * self.group_len(method, part_groups)
             }
             Layout::Tiles { packing, .. } => packing.len(),
         }
@@ -166,23 +196,25 @@ impl Packing {
     }
 
     /// Weights of one part of `part_groups` for one group of inputs.
-    fn group_len(&self, part_groups: usize) -> usize {
-        (TAPS * GROUP * part_groups).next_multiple_of(self.precision.element_vectors()) * GROUP
+    fn group_len(&self, method: Method, part_groups: usize) -> usize {
+        let vectors = 3 * method.column_weights() * GROUP * part_groups;
+        vectors.next_multiple_of(self.precision.element_vectors()) * GROUP
     }
 
-    /// The place of the weight by which `input`, a channel of the map, is multiplied at `tap` for `output`.
-    fn place(&self, output: usize, input: usize, tap: usize) -> usize {
+    /// The place of the weight by which `input`, a channel of the map, is multiplied for `output`: that of a column of
+    /// the kernel and of a row of it or, by [`Method::Winograd`], a point.
+    fn place(&self, output: usize, input: usize, column: usize, row: usize) -> usize {
         match self.layout {
-            Layout::Groups { input_groups, parts, part_groups } => {
+            Layout::Groups { method, input_groups, parts, part_groups } => {
                 let (group, lane) = (output / GROUP, output % GROUP);
                 let (part, group) = (group / part_groups, group % part_groups);
-                let before = (part * input_groups + input / GROUP) * self.group_len(part_groups);
+                let before = (part * input_groups + input / GROUP) * self.group_len(method, part_groups);
                 let first = self.biases(parts * part_groups) + before;
-                let channel = (tap % 3 * 3 + tap / 3) * GROUP + input % GROUP;
+                let channel = (column * method.column_weights() + row) * GROUP + input % GROUP;
                 first + (channel * part_groups + group) * GROUP + lane
             }
             Layout::Tiles { input_blocks, packing } => {
-                packing.place(output, (tap % 3 * input_blocks + input / TILE) * 3 + tap / 3, input)
+                packing.place(output, (column * input_blocks + input / TILE) * 3 + row, input)
             }
         }
     }
@@ -200,8 +232,15 @@ impl Packing {
         for (output, value) in bias.enumerate() {
             parameters[output] = value;
             for (input, channel) in inputs.iter().enumerate() {
-                for tap in 0..TAPS {
-                    parameters[self.place(output, *channel, tap)] = weight(output, input, tap);
+                for column in 0..3 {
+                    let weights = [0, 1, 2].map(|row| weight(output, input, row * 3 + column));
+                    let mut put = |row, weight| parameters[self.place(output, *channel, column, row)] = weight;
+                    match self.layout {
+                        Layout::Groups { method: Method::Winograd, .. } => {
+                            winograd::at_points(weights).into_iter().enumerate().for_each(|(point, at)| put(point, at));
+                        }
+                        _ => weights.into_iter().enumerate().for_each(|(row, weight)| put(row, weight)),
+                    }
                 }
             }
         }
@@ -223,20 +262,23 @@ pub(super) fn products(input: &Map, output: &Map) -> Precision {
 }
 
 /// Adds to the plan's last stage the convolution of the first `input_groups` of `input` into `output`, a map of the
-/// same size in another buffer. Gives the buffer of the parameters, and how they lie there.
+/// same size in another buffer; by `method` where it multiplies vectors in single precision, and by
+/// [`Method::Winograd`] where it does so in half precision. Gives the buffer of the parameters, and how they lie there.
 pub(crate) fn convolve(
     plan: &mut Plan,
     label: &str,
     layer: &ConvLayer,
+    method: Method,
     (input, input_groups): (&Map, usize),
     output: &Map,
 ) -> (BufferId, Packing) {
     layer.check((input, input_groups), output);
     let precision = products(input, output);
+    let method = if precision == Precision::Half { Method::Winograd } else { method };
     let input_blocks = input_groups.div_ceil(TILE / GROUP);
     let packing = match input.format {
         Format::HalfTiles(_) => Packing::of_tiles(input_blocks, output.groups),
-        Format::Single | Format::Half => Packing::new(precision, input_groups, output.groups),
+        Format::Single | Format::Half => Packing::new(method, precision, input_groups, output.groups),
     };
     let parameters = packing.precision.table(plan, "a convolution's parameters", &packing.pack(layer));
     let mut constants = layer.epilogue_constants(output);
@@ -254,11 +296,19 @@ pub(crate) fn convolve(
                 ("INPUT_GROUPS", input_groups.into()),
                 ("PART_GROUPS", part_groups.into()),
             ]);
-            let text = match precision {
-                Precision::Single => include_str!("conv.wgsl"),
-                Precision::Half => include_str!("conv_f16.wgsl"),
+            if method == Method::Winograd {
+                constants.extend(winograd::constants());
+            }
+            let text = match (method, precision) {
+                (Method::Direct, _) => include_str!("conv.wgsl").to_owned(),
+                (Method::Winograd, Precision::Single) => winograd::source("f32", include_str!("conv_winograd.wgsl")),
+                (Method::Winograd, Precision::Half) => {
+                    let fits = (1..=MOST_TRIP_GROUPS).rev().find(|groups| input_groups.is_multiple_of(*groups));
+                    constants.push(("TRIP", fits.expect("each number is a multiple of one").into()));
+                    winograd::source("f16", include_str!("conv_winograd_f16.wgsl"))
+                }
             };
-            (layer.source(input, output, text), ROWS, WORKGROUP)
+            (layer.source(input, output, &text), ROWS, WORKGROUP)
         }
         (_, Layout::Tiles { .. }) => unreachable!("only maps of tiles have such parameters"),
     };
@@ -344,6 +394,7 @@ pub(super) mod tests {
     /// A layer of `outputs` that reads `inputs`, channels of the first groups of a wider map.
     #[derive(Clone)]
     struct Case {
+        method: Method,
         /// Of the input map and of the output map.
         formats: [Format; 2],
         size: (usize, usize),
@@ -356,6 +407,7 @@ pub(super) mod tests {
     impl Case {
         fn new(size: (usize, usize), inputs: usize, outputs: usize, epilogue: Epilogue) -> Self {
             Self {
+                method: Method::Winograd,
                 formats: [Format::Single; 2],
                 size,
                 inputs: (0..inputs).collect(),
@@ -366,7 +418,7 @@ pub(super) mod tests {
         }
 
         fn found(&self) -> Vec<f32> {
-            let Self { formats, size, ref inputs, input_groups, outputs, epilogue } = *self;
+            let Self { method, formats, size, ref inputs, input_groups, outputs, epilogue } = *self;
             let mut plan = Plan::default();
             let input = Map::with(formats[0], &mut plan, "input", size, (input_groups + 1) * GROUP);
             let output = Map::with(formats[1], &mut plan, "output", size, outputs);
@@ -374,7 +426,7 @@ pub(super) mod tests {
             let bias: Vec<_> = (0..outputs).map(|output| noise(9_000_000 + output)).collect();
             let layer = ConvLayer { weight: &weight, bias: &bias, inputs, epilogue, leaky_slope: SLOPE };
             plan.stage("layer", 0);
-            convolve(&mut plan, "convolution", &layer, (&input, input_groups), &output);
+            convolve(&mut plan, "convolution", &layer, method, (&input, input_groups), &output);
             let trial = Trial::new(&plan);
             // What no layer reads is not finite.
             let read = input_groups.next_multiple_of(formats[0].block_groups()) * GROUP;
@@ -405,9 +457,9 @@ pub(super) mod tests {
         }
 
         fn check(&self) {
-            let Self { formats, size, ref inputs, outputs, epilogue, .. } = *self;
+            let Self { method, formats, size, ref inputs, outputs, epilogue, .. } = *self;
             judge(worse(formats), &self.found(), &self.expected()).unwrap_or_else(|error| {
-                panic!("{formats:?}, {size:?}, {} to {outputs}, {epilogue:?}: {error}", inputs.len())
+                panic!("{method:?}, {formats:?}, {size:?}, {} to {outputs}, {epilogue:?}: {error}", inputs.len())
             });
         }
     }
@@ -429,6 +481,17 @@ pub(super) mod tests {
     }
 
     #[test]
+    fn sums_of_direct_products_are_right() {
+        for (size, inputs, outputs, epilogue) in [
+            ((37, 11), 32, 32, Epilogue::Leaky),
+            ((65, 5), 5, 7, Epilogue::ResidualLeaky),
+            ((1, 1), 4, 24, Epilogue::None),
+        ] {
+            Case { method: Method::Direct, ..Case::new(size, inputs, outputs, epilogue) }.check();
+        }
+    }
+
+    #[test]
     fn sums_are_right_for_sizes_around_those_of_workgroups() {
         for size in [(1, 1), (1, 33), (33, 1), (64, 4), (65, 5), (63, 3), (129, 2)] {
             Case::new(size, 5, 7, Epilogue::ResidualLeaky).check();
@@ -440,7 +503,7 @@ pub(super) mod tests {
     fn sums_are_right_in_half_precision() {
         let (single, half) = (Format::Single, Format::Half);
         for formats in [[half, half], [single, half], [half, single]] {
-            for (size, inputs, outputs) in [((65, 5), 5, 7), ((9, 7), 9, 24)] {
+            for (size, inputs, outputs) in [((65, 5), 5, 7), ((9, 7), 9, 24), ((33, 3), 84, 32)] {
                 Case { formats, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky) }.check();
             }
         }
@@ -479,17 +542,24 @@ pub(super) mod tests {
 
     #[test]
     fn parameters_are_replaced_in_place() {
-        let packing = Packing::new(Precision::Single, 2, 5);
-        let bias = |factor: f32| (0..18).map(move |output| factor * noise(output));
-        let mut parameters = vec![0.0; packing.len()];
-        packing.fill(&mut parameters, &[0, 5], bias(1.0), |output, input, tap| noise(100 + output + input + tap));
-        packing.fill(&mut parameters, &[0, 5], bias(2.0), |output, input, tap| noise(output + input + tap));
-        let weight: Vec<_> =
-            (0..18 * 2 * TAPS).map(|place| noise(place / 18 + place / TAPS % 2 + place % TAPS)).collect();
-        let bias: Vec<_> = bias(2.0).collect();
-        let layer =
-            ConvLayer { weight: &weight, bias: &bias, inputs: &[0, 5], epilogue: Epilogue::None, leaky_slope: SLOPE };
-        assert_eq!(parameters, packing.pack(&layer));
+        for method in [Method::Direct, Method::Winograd] {
+            let packing = Packing::new(method, Precision::Single, 2, 5);
+            let bias = |factor: f32| (0..18).map(move |output| factor * noise(output));
+            let mut parameters = vec![0.0; packing.len()];
+            packing.fill(&mut parameters, &[0, 5], bias(1.0), |output, input, tap| noise(100 + output + input + tap));
+            packing.fill(&mut parameters, &[0, 5], bias(2.0), |output, input, tap| noise(output + input + tap));
+            let weight: Vec<_> =
+                (0..18 * 2 * TAPS).map(|place| noise(place / 18 + place / TAPS % 2 + place % TAPS)).collect();
+            let bias: Vec<_> = bias(2.0).collect();
+            let layer = ConvLayer {
+                weight: &weight,
+                bias: &bias,
+                inputs: &[0, 5],
+                epilogue: Epilogue::None,
+                leaky_slope: SLOPE,
+            };
+            assert_eq!(parameters, packing.pack(&layer));
+        }
     }
 
     /// Canary: what is a little off, or not finite, is not right.
@@ -497,8 +567,14 @@ pub(super) mod tests {
     fn a_wrong_value_is_seen() {
         let case = Case::new((9, 7), 5, 7, Epilogue::ResidualLeaky);
         let expected = case.expected();
-        for (format, little) in [(Format::Single, 1e-3), (Format::Half, 0.1), (tiles(), 0.1)] {
-            let case = Case { formats: [format; 2], ..case.clone() };
+        let (direct, winograd) = (Method::Direct, Method::Winograd);
+        for (method, format, little) in [
+            (direct, Format::Single, 1e-3),
+            (winograd, Format::Single, 1e-3),
+            (winograd, Format::Half, 0.1),
+            (winograd, tiles(), 0.1),
+        ] {
+            let case = Case { method, formats: [format; 2], ..case.clone() };
             let precision = format.precision();
             for wrong in [little, f32::NAN] {
                 let mut found = case.found();

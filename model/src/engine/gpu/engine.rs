@@ -6,12 +6,14 @@ use std::time::Duration;
 use holod_calibration::{DisplayGeometry, LevelTables, PupilDiameter};
 use wgpu::{BufferUsages, QuerySet};
 
+use super::conv::Method;
 use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
 use super::map::Format;
 use super::network::NetworkPlan;
 use super::plan::{BufferId, Plan, Stage};
 use super::shared::pupil_values;
+use super::trunk::Features;
 use crate::engine::{EngineError, Precision, StageTiming, StageTimings, check_pupil};
 use crate::gpu::{Gpu, GpuChoice, GpuError, first_that_opens};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
@@ -100,7 +102,8 @@ impl GpuEngine {
         };
         let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
         let format = Format::of(precision, gpu.matrix_units);
-        let mut network = NetworkPlan::new(weights, bench, tables, format, limits)?;
+        let features = Features { format, method: Method::of_vendor(gpu.vendor) };
+        let mut network = NetworkPlan::new(weights, bench, tables, features, limits)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {

@@ -33,11 +33,6 @@ impl Format {
         }
     }
 
-    /// Of what a net with features in this format reads.
-    pub(crate) fn of_inputs(self) -> Self {
-        if let Self::HalfTiles(_) = self { self } else { Self::Single }
-    }
-
     pub(crate) fn precision(self) -> Precision {
         match self {
             Self::Single => Precision::Single,

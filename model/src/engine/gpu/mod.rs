@@ -27,5 +27,6 @@ pub(in crate::engine) mod tests;
 mod trial;
 mod trunk;
 mod upsample;
+mod winograd;
 
 pub use self::engine::{EncodedCounts, GpuEngine};

@@ -5,10 +5,9 @@ use holod_calibration::{DisplayGeometry, LevelTables, PupilDiameter, Resolution}
 use super::expected_stack::ExpectedStack;
 use super::fft::WorkgroupLimits;
 use super::input_features::InputChannels;
-use super::map::Format;
 use super::plan::{BufferId, Plan};
 use super::shared::Shared;
-use super::trunk::{self, Modulated};
+use super::trunk::{self, Features, Modulated};
 use super::upsample::Low;
 use super::{direct, double_phase, levels, upsample};
 use crate::conditions::{Conditions, TrainedRange};
@@ -32,8 +31,7 @@ pub(crate) struct NetworkPlan {
 }
 
 impl NetworkPlan {
-    /// On `bench`, for frames of the pattern's size of `tables`, with features in `format`, on a device of these
-    /// limits.
+    /// On `bench`, for frames of the pattern's size of `tables`, on a device of these limits.
     ///
     /// # Errors
     /// The size is nothing, or too large for that memory; or the weights take focal stacks.
@@ -41,7 +39,7 @@ impl NetworkPlan {
         weights: &Weights,
         bench: &DisplayGeometry,
         tables: &LevelTables,
-        format: Format,
+        features: Features,
         limits: WorkgroupLimits,
     ) -> Result<Self, EngineError> {
         let (resolution, config) = (tables.pattern, &weights.config);
@@ -57,19 +55,19 @@ impl NetworkPlan {
         let shared = Shared::new(&mut plan, resolution, size);
         let mut modulated = Vec::new();
         let mut net = |plan: &mut Plan, prefix: &str, layers: &[_], input: &_, channels: Vec<usize>| {
-            let (output, more) = trunk::run(plan, prefix, layers, config.leaky_slope, format, input, &channels);
+            let (output, more) = trunk::run(plan, prefix, layers, config.leaky_slope, features, input, &channels);
             modulated.extend(more);
             output
         };
         match &weights.family {
             Family::Direct { layers } => {
-                let input = direct::encode(&mut plan, config, &shared, format.of_inputs());
+                let input = direct::encode(&mut plan, config, &shared, features.format);
                 let output = net(&mut plan, "", layers, &input, (0..config.map_channels()).collect());
                 let low = Low::Field(direct::add_residual(&mut plan, config.grid, &shared, &output));
                 upsample::field(&mut plan, &shared, config.grid, low, limits)?;
             }
             Family::ExpectedStack { lighting, correction, feedback } => {
-                let channels = InputChannels::new(config.depth_layers, format.of_inputs());
+                let channels = InputChannels::new(config.depth_layers, features.format);
                 let inputs = channels.map(&mut plan, size);
                 let stack = ExpectedStack::expect(&mut plan, config, bench, &shared, &inputs, limits)?;
                 let lights = net(&mut plan, "lighting ", lighting, &inputs, channels.lighting());

@@ -8,12 +8,14 @@ use holod_calibration::{Colour, DisplayGeometry, LevelTables, PerColour, PupilDi
 use num_complex::{Complex32, Complex64};
 use proptest::prelude::*;
 
+use super::conv::Method;
 use super::engine::GpuEngine;
 use super::fft::WorkgroupLimits;
 use super::map::Format;
 use super::plan::Plan;
 use super::shared::Shared;
 use super::trial::Trial;
+use super::trunk::Features;
 use super::{double_phase, levels};
 use crate::engine::cpu::tests::{OTHER_BENCH, frame};
 use crate::engine::{CpuEngine, EngineError, Precision, reference};
@@ -389,7 +391,7 @@ fn shaders_for_matrix_units_are_valid() {
     use wgpu::naga;
     let limits = WorkgroupLimits { bytes: 32 << 10, threads: 512 };
     let tables = linear_tables(Resolution { width: 50, height: 34 });
-    let format = Format::HalfTiles(MatrixUnits::Device);
+    let features = Features { format: Format::HalfTiles(MatrixUnits::Device), method: Method::Winograd };
     let valid = |source: &str| -> Result<(), String> {
         let capabilities = naga::valid::Capabilities::all();
         let options = naga::front::wgsl::Options { capabilities, ..naga::front::wgsl::Options::new() };
@@ -402,7 +404,7 @@ fn shaders_for_matrix_units_are_valid() {
     let mut with_matrices = 0;
     for weights in [Weights::builtin(), Weights::builtin_small(), Weights::builtin_fast()] {
         let bench = DisplayGeometry::DEFAULT;
-        let network = super::network::NetworkPlan::new(&weights, &bench, &tables, format, limits).expect("a plan");
+        let network = super::network::NetworkPlan::new(&weights, &bench, &tables, features, limits).expect("a plan");
         for shader in network.plan.stages.iter().flat_map(|stage| &stage.dispatches).map(|dispatch| &dispatch.shader) {
             valid(&shader.source).unwrap_or_else(|error| panic!("{}: {error}", shader.label));
             if shader.source.contains("coopMultiplyAdd") {
@@ -532,8 +534,9 @@ fn a_size_whose_lines_do_not_fit_on_the_device_is_told_before_anything_is_made()
     let resolution = Resolution { width: 40_000, height: 2 };
     let limits = WorkgroupLimits { bytes: 16 << 10, threads: 256 };
     let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
-    let refused =
-        super::network::NetworkPlan::new(&weights, &bench, &linear_tables(resolution), Format::Single, limits);
+    let features = Features { format: Format::Single, method: Method::Winograd };
+    let tables = linear_tables(resolution);
+    let refused = super::network::NetworkPlan::new(&weights, &bench, &tables, features, limits);
     let text = refused.err().expect("no workgroup holds such a line").to_string();
     assert!(text.contains("20000") && text.contains("16384") && text.contains("--backend cpu"), "{text}");
 }

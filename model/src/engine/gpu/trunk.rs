@@ -2,7 +2,7 @@
 
 use half::f16;
 
-use super::conv::{self, ConvLayer, Epilogue, Packing};
+use super::conv::{self, ConvLayer, Epilogue, Method, Packing};
 use super::deformable;
 use super::map::{Format, GROUP, Map};
 use super::plan::{BufferId, Plan};
@@ -43,14 +43,22 @@ impl Modulated {
     }
 }
 
+/// How features lie on the device, and how layers that read them multiply.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Features {
+    pub(crate) format: Format,
+    /// Where products are of vectors in single precision.
+    pub(crate) method: Method,
+}
+
 /// Adds a stage for each of `layers`, called `{prefix}layer 0` and so on. The first one reads the channels `inputs` of
-/// `input`, and features are in `format`. Returns the last one's map, and what depends on the pupil.
+/// `input`. Returns the last one's map, and what depends on the pupil.
 pub(super) fn run(
     plan: &mut Plan,
     prefix: &str,
     layers: &[Layer],
     leaky_slope: f32,
-    format: Format,
+    Features { format, method }: Features,
     input: &Map,
     inputs: &[usize],
 ) -> (Map, Vec<Modulated>) {
@@ -80,7 +88,7 @@ pub(super) fn run(
         plan.stage(&name, (2 * 9 * layer.in_channels * outputs * size.0 * size.1) as u64);
         let conv = ConvLayer { weight: &layer.weight, bias: &layer.bias, inputs: channels, epilogue, leaky_slope };
         let Some(adjustable) = &layer.adjustable else {
-            conv::convolve(plan, &name, &conv, (from, groups), to);
+            conv::convolve(plan, &name, &conv, method, (from, groups), to);
             continue;
         };
         let offsets = Map::new(plan, "offsets", size, OFFSET_CHANNELS);
@@ -90,7 +98,8 @@ pub(super) fn run(
             epilogue: Epilogue::None,
             ..conv
         };
-        let (buffer, packing) = conv::convolve(plan, &format!("{name}: offsets"), &predicted, (from, groups), &offsets);
+        let label = format!("{name}: offsets");
+        let (buffer, packing) = conv::convolve(plan, &label, &predicted, method, (from, groups), &offsets);
         modulated.push(Modulated {
             modulation: Modulation::new(adjustable, leaky_slope),
             inputs: channels.to_vec(),

@@ -24,10 +24,12 @@ use serde::Serialize;
 
 use self::assembly::{Assembly, Work};
 use self::null_device::{Binary, NullDevice, Request};
+use super::conv::Method;
 use super::fft::WorkgroupLimits;
 use super::map::Format;
 use super::network::NetworkPlan;
 use super::plan::{Dispatch, Plan, Shader};
+use super::trunk::Features;
 use crate::Weights;
 use crate::engine::EngineError;
 
@@ -219,6 +221,7 @@ impl FramePlan {
     /// The size is nothing, or too large.
     pub fn new(weights: &Weights, resolution: Resolution, half_precision: bool) -> Result<Self, EngineError> {
         let format = if half_precision { Format::Half } else { Format::Single };
+        let features = Features { format, method: Method::Winograd };
         // A panel of 8 bits.
         let levels = [0; 3].map(|_| (0..256).collect());
         let tables = LevelTables {
@@ -231,7 +234,7 @@ impl FramePlan {
             levels: PerColour(levels),
             flatness: PerColour([None, None, None]),
         };
-        Ok(Self(NetworkPlan::new(weights, &DisplayGeometry::DEFAULT, &tables, format, LIMITS)?.plan))
+        Ok(Self(NetworkPlan::new(weights, &DisplayGeometry::DEFAULT, &tables, features, LIMITS)?.plan))
     }
 
     /// Labels of the shaders, each once.
