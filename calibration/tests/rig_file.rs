@@ -218,7 +218,7 @@ fn wrong_types_are_named() {
     check("bit_depth = 8", "bit_depth = 9", "panel.bit_depth", "9", "8, 10 or 16", "");
     check("bit_depth = 8", "bit_depth = true", "panel.bit_depth", "a boolean true", "a number", "");
     check("mode = ", "mode = 3 #", "panel.mode", "an integer 3", "\"channel-packed\"", "in double quotes");
-    check("eye = \"both\"", "eye = \"\"", "tracker.eye", "an empty text", "\"left\"", "");
+    check("eye = \"both\"", "eye = \"\"", "tracker.eye", "\"\"", "\"left\"", "");
     check("eye = \"both\"", "eye = \"best\"", "tracker.eye", "", "\"better\"", "");
     let flag = faults_of(&changed(&[("lit_ms = 3.0", "lit_ms = 3.0\ngated_by_panel = \"no\"")]));
     assert!(flag.iter().any(|fault| fault.expected == "true or false" && fault.advice.contains("without quotes")));

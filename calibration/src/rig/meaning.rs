@@ -731,7 +731,7 @@ impl fmt::Display for Meaning {
 }
 
 impl Meaning {
-    /// Who it is, and what of a scene it can show.
+    /// The rig's name and file, and what of a scene it can show.
     fn write_view(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "rig            {}", self.name)?;
         if let Some(hash) = &self.text_hash {

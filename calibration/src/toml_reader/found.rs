@@ -14,7 +14,7 @@ pub struct Found<'a, T> {
     /// Its key's full path, for example `serial.start[0].send`.
     pub key: String,
     /// The line of the file, from 1; none of what comes from elsewhere.
-    pub line: Option<usize>,
+    pub(crate) line: Option<usize>,
     pub(super) reader: &'a Reader<'a>,
 }
 
@@ -65,13 +65,22 @@ impl<'a> Found<'a, &'a Item> {
         text
     }
 
-    /// A text with something in it, and no NUL character.
+    /// A text with something in it, and no NUL character, of a key that may be left out.
     pub fn text(&self, expected: &str) -> Option<&'a str> {
+        self.text_or(expected, "fill it in or take it out")
+    }
+
+    /// The same of a key that may not.
+    pub(super) fn required_text(&self, expected: &str) -> Option<&'a str> {
+        self.text_or(expected, "fill it in")
+    }
+
+    fn text_or(&self, expected: &str, advice_if_empty: &str) -> Option<&'a str> {
         let text = self.raw_text(expected)?;
         if text.contains('\0') {
             self.fault("a text with a NUL character", expected, "take that out");
         } else if text.trim().is_empty() {
-            self.fault("an empty text", expected, "fill it in or take it out");
+            self.fault("an empty text", expected, advice_if_empty);
         } else {
             return Some(text);
         }
@@ -81,7 +90,7 @@ impl<'a> Found<'a, &'a Item> {
     /// What one of the named `choices` stands for.
     pub fn choose<T: Clone>(&self, choices: &[(&'static str, T)]) -> Option<T> {
         let expected = one_of(choices);
-        let text = self.text(&expected)?;
+        let text = self.raw_text(&expected)?;
         let choice = choices.iter().find(|(name, _)| *name == text).map(|(_, value)| value.clone());
         if choice.is_none() {
             let names: Vec<_> = choices.iter().map(|(name, _)| *name).collect();

@@ -62,7 +62,7 @@ impl<'a> Section<'a> {
         if self.path.is_empty() { key.into() } else { format!("{}.{key}", self.path) }
     }
 
-    /// Whether the file has this table.
+    /// Whether the file has this table, or a place that stands for one.
     pub const fn is_there(&self) -> bool {
         self.table.is_some()
     }
@@ -169,7 +169,7 @@ impl<'a> Section<'a> {
     /// A text with something in it; a fault where the key is missing.
     pub fn required_text(&self, key: &'static str, expected: &str) -> Option<Found<'a, &'a str>> {
         let found = self.require(key, expected)?;
-        Some(found.with(found.text(expected)?))
+        Some(found.with(found.required_text(expected)?))
     }
 
     /// One of the named choices; a fault where the key is missing and `required`.

@@ -27,7 +27,7 @@ fn read(root: &Section<'_>) -> Option<Profile> {
         found.choose(&[(SCHEMA, ())]);
     }
     let name = root.required_text("name", "the profile's name");
-    let about = root.text("about", "one sentence about the tracker").map_or("", |about| about.value);
+    let about = root.get("about").and_then(|found| found.raw_text("one sentence about the tracker")).unwrap_or("");
     let eye = root.get("eye").and_then(|found| Some(found.with(found.choose(&EYES)?)));
     let rate_hz = root.positive("rate_hz").and_then(|rate_hz| Some(root.get("rate_hz")?.with(rate_hz)));
     let size_at = root.get("size").map(|found| found.with(()));

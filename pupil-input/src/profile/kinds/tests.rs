@@ -33,7 +33,7 @@ fn each_mistake_is_told_with_its_line_and_key() {
             "line 1, format: found \"holod-tracker-2\"; expected one of \"holod-tracker-1\"",
         ),
         ("", "format = \"holod-tracker-1\"\n[wire]\nkind = \"holod\"", "name: found nothing"),
-        ("", "name = \"\"", "line 1, name: found an empty text"),
+        ("", "name = \"\"", "line 1, name: found an empty text; expected the profile's name; fill it in\n"),
         ("", "wires = 1", "line 1, wires: found an unknown key"),
         ("", "wires = 1", "did you mean `wire`?"),
         ("", "eye = \"middle\"", "line 1, eye: found \"middle\"; expected one of \"left\", \"right\", \"both\""),
@@ -235,6 +235,7 @@ fn each_mistake_is_told_with_its_line_and_key() {
     // The canary: what is right has no fault.
     assert_eq!(faults(LINES, size), "");
     assert_eq!(faults(PACKET, &format!("{packet}{pupil}")), "");
+    assert_eq!(faults("about = \"\"\n", &format!("{LINES}{size}")), "", "a tracker of which there is nothing to say");
     let eye = "eye = \"left\"
 ";
     assert!(faults(eye, &format!("{LINES}{size}")).contains("line 1, eye: found left; expected no eye here"));
