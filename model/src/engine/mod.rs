@@ -110,7 +110,7 @@ pub struct StageTiming {
     /// Wall-clock time that the stage took of the last frame.
     pub duration: Duration,
     /// Floating-point operations of matrix-like work as its definition has them, two to a multiply-add; 0 for other
-    /// stages. Winograd's filtering does with a quarter of those of a plain layer.
+    /// stages. Of those of a plain layer Winograd's filtering does with a quarter on a processor, and with half on a GPU.
     pub flop: u64,
     /// The least that its definition moves: each map, plane or field that it is given, read once, and each that it
     /// hands on, written once, without padding. What it makes on the way, parameters and tables do not count. 0 where

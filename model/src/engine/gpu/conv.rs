@@ -30,12 +30,14 @@ pub(crate) enum Method {
 }
 
 impl Method {
+    /// A maker's number at PCI.
+    pub(super) const NVIDIA: u32 = 0x10de;
+
     /// Of layers in single precision, on a device of this maker's number at PCI. NVIDIA's devices load weights by the
     /// way of all memory, and four products of one in a thread pay for it; those of others have a way of their own for
     /// what all threads share, and one product is enough.
     pub(crate) fn of_vendor(vendor: u32) -> Self {
-        const NVIDIA: u32 = 0x10de;
-        if vendor == NVIDIA { Self::Direct } else { Self::Winograd }
+        if vendor == Self::NVIDIA { Self::Direct } else { Self::Winograd }
     }
 
     /// Groups of output channels that a thread holds sums of, at most: with so many a shader has registers left for
@@ -177,7 +179,7 @@ impl Packing {
     pub(crate) fn len(&self) -> usize {
         match self.layout {
             Layout::Groups { method, input_groups, parts, part_groups } => {
-                self.biases(parts * part_groups) + parts * input_groups * self.group_len(method, part_groups)
+                self.biases(parts * part_groups) + parts * input_groups * Self::group_len(method, part_groups)
             }
             Layout::Tiles { packing, .. } => packing.len(),
         }
@@ -196,9 +198,8 @@ impl Packing {
     }
 
     /// Weights of one part of `part_groups` for one group of inputs.
-    fn group_len(&self, method: Method, part_groups: usize) -> usize {
-        let vectors = 3 * method.column_weights() * GROUP * part_groups;
-        vectors.next_multiple_of(self.precision.element_vectors()) * GROUP
+    fn group_len(method: Method, part_groups: usize) -> usize {
+        3 * method.column_weights() * GROUP * part_groups * GROUP
     }
 
     /// The place of the weight by which `input`, a channel of the map, is multiplied for `output`: that of a column of
@@ -208,7 +209,7 @@ impl Packing {
             Layout::Groups { method, input_groups, parts, part_groups } => {
                 let (group, lane) = (output / GROUP, output % GROUP);
                 let (part, group) = (group / part_groups, group % part_groups);
-                let before = (part * input_groups + input / GROUP) * self.group_len(method, part_groups);
+                let before = (part * input_groups + input / GROUP) * Self::group_len(method, part_groups);
                 let first = self.biases(parts * part_groups) + before;
                 let channel = (column * method.column_weights() + row) * GROUP + input % GROUP;
                 first + (channel * part_groups + group) * GROUP + lane
@@ -485,6 +486,7 @@ pub(super) mod tests {
         for (size, inputs, outputs, epilogue) in [
             ((37, 11), 32, 32, Epilogue::Leaky),
             ((65, 5), 5, 7, Epilogue::ResidualLeaky),
+            ((63, 3), 24, 18, Epilogue::None),
             ((1, 1), 4, 24, Epilogue::None),
         ] {
             Case { method: Method::Direct, ..Case::new(size, inputs, outputs, epilogue) }.check();
@@ -498,12 +500,13 @@ pub(super) mod tests {
         }
     }
 
-    /// Between maps of both precisions; an odd number of groups does not fill its elements.
+    /// Between maps of both precisions, with one to four groups to a trip of the loop, and a last part that the map does
+    /// not fill.
     #[test]
     fn sums_are_right_in_half_precision() {
         let (single, half) = (Format::Single, Format::Half);
         for formats in [[half, half], [single, half], [half, single]] {
-            for (size, inputs, outputs) in [((65, 5), 5, 7), ((9, 7), 9, 24), ((33, 3), 84, 32)] {
+            for (size, inputs, outputs) in [((65, 5), 5, 7), ((9, 7), 9, 24), ((33, 3), 84, 32), ((17, 5), 32, 18)] {
                 Case { formats, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky) }.check();
             }
         }

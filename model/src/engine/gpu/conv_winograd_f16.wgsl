@@ -5,8 +5,7 @@
 // winograd.wgsl in registers. Threads of a workgroup lie along x and multiply by the same weights at the same time.
 
 @group(0) @binding(0) var<storage, read> input: array<InVector>;
-// As in conv_winograd.wgsl, with eight vectors to an element, and the weights of each input group filled up to whole
-// elements.
+// As in conv_winograd.wgsl, with eight vectors to an element.
 @group(0) @binding(1) var<storage, read> parameters: array<array<Vector, 8>>;
 @group(0) @binding(2) var<storage, read_write> output: array<OutVector>;
 
@@ -20,7 +19,7 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
 
     // The pixel above and to the left; threads beyond the last column read what that one reads.
     var pixel = y * IN_GROUPS * IN_PITCH + min(x, WIDTH - 1u);
-    let group_elements = (72u * PART_GROUPS + 7u) / 8u;
+    let group_elements = 9u * PART_GROUPS;
     var weight = (PARTS * PART_GROUPS + 7u) / 8u + part * INPUT_GROUPS * group_elements;
     for (var trip = 0u; trip < INPUT_GROUPS / TRIP; trip++) {
         var trip_sums: array<array<Vector, POINTS>, PART_GROUPS>;

@@ -308,6 +308,19 @@ fn the_built_in_networks_match_the_reference_at_both_ends_of_the_pupil_range() {
     }
 }
 
+/// The makers whose devices multiply each input by each weight are not those of software devices.
+#[test]
+fn a_network_of_direct_products_matches_the_reference_at_both_ends_of_the_pupil_range() {
+    let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
+    let mut gpu = test_gpu();
+    gpu.vendor = Method::NVIDIA;
+    let tables = linear_tables(SIZE);
+    let mut engine = GpuEngine::on(gpu, &weights, &bench, &tables, Some(Precision::Single)).expect("an engine");
+    for pupil_mm in [1.0, 5.0] {
+        check_engine(&mut engine, &bench, &weights, SIZE, pupil_mm, 4);
+    }
+}
+
 /// Of tests that can have any size: the software device compiles every shader for each one.
 const SIZE: Resolution = Resolution { width: 37, height: 22 };
 
