@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// One of a few reasons.
 pub(crate) trait Reason: Copy + PartialEq + 'static {
-    /// Every reason, in the order of their counts.
+    /// Every reason; counts are kept in this order.
     const ALL: &'static [Self];
 
     /// What it is called in a status and in figures.

@@ -20,9 +20,9 @@ pub enum ArrayColours<'a> {
 /// Depths of a picture, [height, width].
 #[derive(Clone, Copy, Debug)]
 pub enum ArrayDepths<'a> {
-    /// Metres, all above 0.
+    /// Metres; what is not above 0 is no depth.
     MetresF32(&'a [f32]),
-    /// Millimetres, all above 0.
+    /// Millimetres; what is not above 0 is no depth.
     MillimetresF32(&'a [f32]),
     /// Millimetres; 0 is no depth.
     MillimetresU16(&'a [u16]),

@@ -178,7 +178,7 @@ impl Trial {
         }
     }
 
-    /// The plots above the report's text, as large as the terminal lets them be.
+    /// The plots above the report's text, as large as a terminal lets them be, and of a fixed height without one.
     fn picture(&self, report: &Report, now: TimeNs) -> String {
         let text = text_of(report);
         format!("{}\n{text}", traces(&self.observed, now, LiveText::visible(), text.lines().count()))
