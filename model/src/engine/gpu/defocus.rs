@@ -4,20 +4,22 @@ use holod_calibration::DisplayGeometry;
 
 use super::fft::Lines;
 use super::grid_transforms::GridTransforms;
-use super::input_features::{InputChannels, grid_constants, plane_bytes, sample_pitch};
+use super::input_features::{InputChannels, PlaneBytes, grid_constants, layers_together, sample_pitch};
 use super::map::{GROUP, Map};
 use super::plan::{BufferId, Constant, Plan};
 use super::shared::Shared;
+use crate::engine::Precision;
 use crate::engine::constants::{LEAST_COVER, PAIRS};
 use crate::engine::disc::DiscTable;
-use crate::weights::NetworkConfig;
+use crate::weights::{CONDITIONS, NetworkConfig};
 
 /// Foci whose spectra a thread holds at once; where there are more layers, these are transformed anew for each so many.
 const MOST_FOCI: usize = 8;
 /// Samples of each of these that a thread holds.
 const BLUR_ITEMS: usize = 4;
-/// Samples that a thread holds of the rows of a frame, and of the colours at four foci.
-const ROW_ITEMS: usize = 4;
+/// Samples that a thread holds of the rows of a frame, and of what is seen.
+const FRAME_ITEMS: usize = 6;
+const ROW_ITEMS: usize = 8;
 
 /// Planes of complex numbers on the network's grid that the stage needs as scratch.
 pub(super) fn scratch_planes(depth_layers: usize) -> usize {
@@ -25,8 +27,8 @@ pub(super) fn scratch_planes(depth_layers: usize) -> usize {
     buffers * PAIRS * depth_layers
 }
 
-/// Adds the stage `expected stack`, which writes the layers of each block's corners, the stack, and to `inputs` the
-/// frame's maps and the stack.
+/// Adds the stage `expected stack`, which writes the layers of each block's corners, and to `inputs` what the first net
+/// reads.
 #[expect(clippy::too_many_arguments)]
 pub(super) fn expect(
     plan: &mut Plan,
@@ -35,7 +37,6 @@ pub(super) fn expect(
     shared: &Shared,
     grid: &GridTransforms,
     layer_of: BufferId,
-    stack: BufferId,
     inputs: &Map,
 ) {
     let (count, size) = (config.depth_layers, shared.size);
@@ -43,7 +44,7 @@ pub(super) fn expect(
     let disc_table = plan.table("the spectrum of a disc", &disc.values);
 
     let foci = count.min(MOST_FOCI);
-    let first_part = InputChannels::new(count, inputs.format).field;
+    let channels = InputChannels::new(count, inputs.format);
     let constants: Vec<(&str, Constant)> = grid_constants(shared.resolution, size)
         .into_iter()
         .chain([
@@ -51,8 +52,11 @@ pub(super) fn expect(
             ("PAIRS", PAIRS.into()),
             ("LEAST_COVER", LEAST_COVER.into()),
             ("FOCI", foci.into()),
+            // In single precision 3 registers would spill, of 8 layers on RDNA 3.
+            ("ASKS_EARLY", (shared.stored == Precision::Half).into()),
             ("FIRST_SEEN", (scratch_planes(count) - PAIRS * count).into()),
-            ("FIRST_PART_GROUPS", (first_part / GROUP).into()),
+            ("LAYERS_TOGETHER", layers_together(count).into()),
+            ("STACK_GROUP", (channels.stack / GROUP).into()),
             ("DISC_ENTRIES", disc.values.len().into()),
             ("ENTRIES_PER_MM", (disc.entries_per_mm as f32).into()),
         ])
@@ -62,17 +66,27 @@ pub(super) fn expect(
     let files = [&declared, include_str!("blocks.wgsl"), features, include_str!("defocus.wgsl")];
     let shader = |lines: &Lines, entry| lines.shader(&format!("defocus: {entry}"), &constants, &files, entry);
     let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(BLUR_ITEMS));
+    let frame_rows = grid.rows.rows(FRAME_ITEMS);
     let (row_groups, column_groups) = (rows.workgroups(size.height), columns.workgroups(size.width));
-    let [complex, real, group] = plane_bytes(size);
+    let PlaneBytes { byte, complex, group, .. } = PlaneBytes::new(shared, inputs.format);
     let (chunks, spectra) = (count.div_ceil(foci), (PAIRS * count) as u64 * complex);
+    let stack_groups = (3 * count).div_ceil(GROUP);
+    let other_groups = (channels.told + CONDITIONS).div_ceil(GROUP) - stack_groups;
     let frame_bytes = (4 * size_of::<f32>() * shared.resolution.pixels()) as u64;
     let stage = plan.stage("expected stack", 0);
     let take_layers = stage.dispatch_with(
-        shader(&rows, "take_layers"),
-        &[rows.turns(), (1, shared.frame), (2, shared.pupil), (3, layer_of), (4, grid.spectra), (7, inputs.buffer)],
-        [row_groups, 1, 1],
+        shader(&frame_rows, "take_layers"),
+        &[
+            frame_rows.turns(),
+            (1, shared.frame),
+            (2, shared.pupil),
+            (3, layer_of),
+            (4, grid.spectra),
+            (6, inputs.buffer),
+        ],
+        [frame_rows.workgroups(size.height), 1, 1],
     );
-    take_layers.bytes = Some(frame_bytes + real + spectra + 5 * group);
+    take_layers.bytes = Some(frame_bytes + 4 * byte + spectra + other_groups as u64 * group);
     let blur = stage.dispatch_with(
         shader(&columns, "blur"),
         &[columns.turns(), (2, shared.pupil), (4, grid.spectra), (5, disc_table)],
@@ -81,8 +95,8 @@ pub(super) fn expect(
     blur.bytes = Some((chunks as u64 + 1) * spectra);
     let see = stage.dispatch_with(
         shader(&rows, "see"),
-        &[rows.turns(), (2, shared.pupil), (4, grid.spectra), (6, stack), (7, inputs.buffer)],
-        [row_groups, 1 + (count - 2).div_ceil(4), 1],
+        &[rows.turns(), (2, shared.pupil), (4, grid.spectra), (6, inputs.buffer)],
+        [row_groups, count / layers_together(count), 1],
     );
-    see.bytes = Some(spectra + 3 * count as u64 * real + (first_part / GROUP - 5) as u64 * group);
+    see.bytes = Some(spectra + stack_groups as u64 * group);
 }

@@ -28,7 +28,7 @@ pub(super) fn encode(plan: &mut Plan, config: &NetworkConfig, shared: &Shared, f
 pub(super) fn add_residual(plan: &mut Plan, grid: Grid, shared: &Shared, output: &Map) -> BufferId {
     let size = shared.size;
     let low = match grid {
-        Grid::HalfBand => plan.buffer::<[f32; 2]>("the field on the network's grid", 3 * size.pixels()),
+        Grid::HalfBand => shared.stored.complex_buffer(plan, "the field on the network's grid", 3 * size.pixels()),
         Grid::Full => shared.field,
     };
     let shader = shader(grid, shared, output, "add_residual");
@@ -53,6 +53,6 @@ fn shader(grid: Grid, shared: &Shared, map: &Map, entry: &'static str) -> Arc<Sh
         ("HEIGHT", shared.size.height.into()),
         ("SCALE", scale.into()),
     ];
-    let source = [map.declaration("map"), include_str!("direct.wgsl").to_owned()].concat();
+    let source = [&map.declaration("map"), shared.stored.complex(), include_str!("direct.wgsl")].concat();
     Arc::new(Shader::new(format!("direct: {entry}"), &constants, &source, entry))
 }

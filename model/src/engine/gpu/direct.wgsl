@@ -1,6 +1,6 @@
 // What the `direct` family's net reads, and the field that it gives. After these constants:
 // WORKGROUP (pixels of a row), FRAME_WIDTH, FRAME_HEIGHT, WIDTH, HEIGHT (of the network's grid), SCALE (panel pixels to
-// a sample, each way), and what the map declares of itself.
+// a sample, each way), what the map declares of itself, and how buffers hold complex numbers.
 
 // The eye's pupil in millimetres, and what networks are told of it and the bench (conditions.rs).
 struct Pupil {
@@ -12,7 +12,7 @@ struct Pupil {
 @group(0) @binding(0) var<storage, read> frame: array<f32>; // [4, frame height, frame width]
 @group(0) @binding(1) var<storage, read> pupil: Pupil;
 @group(0) @binding(2) var<storage, read_write> map: array<map_vector>;
-@group(0) @binding(3) var<storage, read_write> low: array<vec2f>; // [3, height, width]
+@group(0) @binding(3) var<storage, read_write> low: array<Stored>; // [3, height, width]
 
 const BLOCK: u32 = SCALE * SCALE;
 
@@ -72,6 +72,6 @@ fn add_residual(@builtin(global_invocation_id) place: vec3u) {
         for (var corner = 0u; corner < BLOCK; corner++) {
             sum += at(colour, x, y, corner);
         }
-        low[(colour * HEIGHT + y) * WIDTH + x] = vec2f(sum / f32(BLOCK), 0.0) + residual[colour];
+        low[(colour * HEIGHT + y) * WIDTH + x] = stored(vec2f(sum / f32(BLOCK), 0.0) + residual[colour]);
     }
 }

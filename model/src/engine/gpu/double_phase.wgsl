@@ -1,14 +1,16 @@
-// Double phase; optics/double_phase.rs says what it does and why. After these constants and phase_math.wgsl:
-// WIDTH, HEIGHT, AMPLITUDE_SCALE, those of double_phase.rs, and SIDE: the edge of what a workgroup of `phases` does.
+// Double phase; optics/double_phase.rs says what it does and why. After these constants, how buffers hold complex numbers
+// and phase_math.wgsl: WIDTH, HEIGHT, AMPLITUDE_SCALE, and those of double_phase.rs.
 
-@group(0) @binding(0) var<storage, read> field: array<vec2f>; // [3, height, width]
-@group(0) @binding(1) var<storage, read_write> errors: array<vec2f>; // [3, height, width]
+@group(0) @binding(0) var<storage, read> field: array<Stored>; // [3, height, width]
+@group(0) @binding(1) var<storage, read_write> tile_powers: array<f32>; // [3, tiles down, tiles across]
 @group(0) @binding(2) var<storage, read_write> clipped_samples: array<atomic<u32>, 3>;
 @group(0) @binding(3) var<storage, read_write> phases_rad: array<f32>; // [3, height, width]
 
 // Edge of the blocks of a thread, in pixels.
 const BLOCK: u32 = 4;
-const THREADS: u32 = (TILE / BLOCK) * (TILE / BLOCK);
+const TILE_THREADS: u32 = (TILE / BLOCK) * (TILE / BLOCK);
+const TILES_ACROSS: u32 = (WIDTH + TILE - 1) / TILE;
+const TILES_DOWN: u32 = (HEIGHT + TILE - 1) / TILE;
 
 struct Clipped {
     value: vec2f,
@@ -34,40 +36,67 @@ fn unit(value: vec2f) -> vec2f {
     return value / sqrt(max(dot(value, value), 1e-30));
 }
 
-var<workgroup> powers: array<f32, THREADS>;
+var<workgroup> powers: array<f32, TILE_THREADS>;
 var<workgroup> outside: atomic<u32>;
 
-// One tile of one colour: what is left of a without the phasor of its pair.
-@compute @workgroup_size(THREADS)
-fn pair_errors(@builtin(workgroup_id) tile: vec3u, @builtin(local_invocation_index) thread: u32) {
-    let left = tile.x * TILE + thread % (TILE / BLOCK) * BLOCK;
-    let top = tile.y * TILE + thread / (TILE / BLOCK) * BLOCK;
+// The sum of intensities of one tile of one colour, and how many of its samples are clipped.
+@compute @workgroup_size(TILE_THREADS)
+fn measure_tiles(@builtin(workgroup_id) tile: vec3u, @builtin(local_invocation_index) thread: u32) {
+    // Neighbouring threads read neighbouring columns.
+    let x = tile.x * TILE + thread % TILE;
     let plane = tile.z * WIDTH * HEIGHT;
-
-    var a: array<vec2f, 16>;
     var power = 0.0;
     var count = 0u;
+    for (var row = thread / TILE; row < TILE; row += TILE_THREADS / TILE) {
+        let y = tile.y * TILE + row;
+        if x < WIDTH && y < HEIGHT {
+            let sample = clipped(loaded(field[plane + y * WIDTH + x]));
+            power += dot(sample.value, sample.value);
+            count += u32(!sample.inside);
+        }
+    }
+    powers[thread] = power;
+    if count > 0u {
+        atomicAdd(&outside, count);
+    }
+    workgroupBarrier();
+    if thread == 0u {
+        var tile_power = 0.0;
+        for (var other = 0u; other < TILE_THREADS; other++) {
+            tile_power += powers[other];
+        }
+        tile_powers[(tile.z * TILES_DOWN + tile.y) * TILES_ACROSS + tile.x] = tile_power;
+        if atomicLoad(&outside) > 0u {
+            atomicAdd(&clipped_samples[tile.z], atomicLoad(&outside));
+        }
+    }
+}
+
+// What a workgroup of `phases` does: blocks across and down, less one at each edge, whose errors others need.
+const THREADS: u32 = BLOCKS_ACROSS * BLOCKS_DOWN;
+const ACROSS: u32 = (BLOCKS_ACROSS - 2) * BLOCK;
+const DOWN: u32 = (BLOCKS_DOWN - 2) * BLOCK;
+// Rows of a column that a thread does.
+const STRIP: u32 = DOWN / STRIPS;
+// With what the binomial filter 1 4 6 4 1 reaches.
+const ERRORS_ACROSS: u32 = ACROSS + 2 * REACH;
+const ERRORS_DOWN: u32 = DOWN + 2 * REACH;
+
+// What is left of a without the phasor of its pair.
+var<workgroup> errors: array<vec2f, ERRORS_ACROSS * ERRORS_DOWN>;
+
+// Those of the block at (left, top), as far as they are needed.
+fn find_errors(left: u32, top: u32, colour: u32, block_x: u32, block_y: u32) {
+    var a: array<vec2f, 16>;
     for (var pixel = 0u; pixel < 16u; pixel++) {
         let x = left + pixel % 4u;
         let y = top + pixel / 4u;
         a[pixel] = vec2f(0.0);
         if x < WIDTH && y < HEIGHT {
-            let sample = clipped(field[plane + y * WIDTH + x]);
-            a[pixel] = sample.value;
-            count += u32(!sample.inside);
+            a[pixel] = clipped(loaded(field[(colour * HEIGHT + y) * WIDTH + x])).value;
         }
-        power += dot(a[pixel], a[pixel]);
     }
-    powers[thread] = power;
-    atomicAdd(&outside, count);
-    workgroupBarrier();
-    var tile_power = 0.0;
-    for (var other = 0u; other < THREADS; other++) {
-        tile_power += powers[other];
-    }
-    if thread == 0u && atomicLoad(&outside) > 0u {
-        atomicAdd(&clipped_samples[tile.z], atomicLoad(&outside));
-    }
+    let tile_power = tile_powers[(colour * TILES_DOWN + top / TILE) * TILES_ACROSS + left / TILE];
     let dark = clamp(DARK_SHARE * sqrt(tile_power / f32(TILE * TILE)), LEAST_DARK, MOST_DARK);
     let floor = dark * dark * dark;
 
@@ -89,27 +118,21 @@ fn pair_errors(@builtin(workgroup_id) tile: vec3u, @builtin(local_invocation_ind
     }
 
     for (var pixel = 0u; pixel < 16u; pixel++) {
-        let x = left + pixel % 4u;
-        let y = top + pixel / 4u;
-        if x >= WIDTH || y >= HEIGHT {
-            continue;
-        }
+        // Left of and above what is needed these wrap round to what is too large.
+        let x = block_x * BLOCK + pixel % 4u + REACH - BLOCK;
+        let y = block_y * BLOCK + pixel / 4u + REACH - BLOCK;
         let value = a[pixel];
         // The carrier at its own length.
         let carrier = dot(value, value) * value + floor * quarters[pixel / 8u * 2u + pixel % 4u / 2u];
         let square = max(dot(carrier, carrier), 1e-30);
         let along = dot(value, carrier);
         let across = sqrt(max(square - along * along, 0.0));
-        let pair = vec2f(along, select(-across, across, (x + y) % 2u == 1u));
-        errors[plane + y * WIDTH + x] = value - times(carrier, pair) / square;
+        let pair = vec2f(along, select(-across, across, (pixel % 4u + pixel / 4u) % 2u == 1u));
+        if x < ERRORS_ACROSS && y < ERRORS_DOWN {
+            errors[y * ERRORS_ACROSS + x] = value - times(carrier, pair) / square;
+        }
     }
 }
-
-// With what the binomial filter 1 4 6 4 1 reaches.
-const AROUND: u32 = SIDE + 2 * REACH;
-
-var<workgroup> around: array<vec2f, AROUND * AROUND>;
-var<workgroup> columns: array<vec2f, AROUND * SIDE>;
 
 // Where the sample `padded` - REACH of `count` is, mirrored about the outermost ones, which keeps a checkerboard one.
 // What is farther off than `count` is the nearest.
@@ -126,38 +149,62 @@ fn binomial(a: vec2f, b: vec2f, c: vec2f, d: vec2f, e: vec2f) -> vec2f {
     return 0.375 * c + 0.25 * (b + d) + 0.0625 * (a + e);
 }
 
+// Row `padded` - REACH of the errors through the filter, around these columns. Beyond the last row that one of the image
+// needs, all are that one.
+fn filtered_row(columns: array<u32, 5>, padded: u32, top: u32) -> vec2f {
+    let row = mirrored(min(padded, HEIGHT + 2u * REACH - 1u), HEIGHT) + REACH - top;
+    let first = row * ERRORS_ACROSS;
+    return binomial(
+        errors[first + columns[0]],
+        errors[first + columns[1]],
+        errors[first + columns[2]],
+        errors[first + columns[3]],
+        errors[first + columns[4]],
+    );
+}
+
 // The phases of a corrected by what the errors have in the band.
-@compute @workgroup_size(SIDE, SIDE)
-fn phases(
-    @builtin(workgroup_id) part: vec3u,
-    @builtin(local_invocation_id) place: vec3u,
-    @builtin(local_invocation_index) thread: u32,
-) {
-    let plane = part.z * WIDTH * HEIGHT;
-    for (var index = thread; index < AROUND * AROUND; index += SIDE * SIDE) {
-        let x = mirrored(part.x * SIDE + index % AROUND, WIDTH);
-        let y = mirrored(part.y * SIDE + index / AROUND, HEIGHT);
-        around[index] = errors[plane + y * WIDTH + x];
+@compute @workgroup_size(THREADS)
+fn phases(@builtin(workgroup_id) part: vec3u, @builtin(local_invocation_index) thread: u32) {
+    let left = part.x * ACROSS;
+    let top = part.y * DOWN;
+    let block_x = thread % BLOCKS_ACROSS;
+    let block_y = thread / BLOCKS_ACROSS;
+    // What is left of the image or above it wraps round to what is too large.
+    let block_left = left + block_x * BLOCK - BLOCK;
+    let block_top = top + block_y * BLOCK - BLOCK;
+    if block_left < WIDTH && block_top < HEIGHT {
+        find_errors(block_left, block_top, part.z, block_x, block_y);
     }
     workgroupBarrier();
-    for (var index = thread; index < AROUND * SIDE; index += SIDE * SIDE) {
-        columns[index] = binomial(
-            around[index], around[index + AROUND], around[index + 2u * AROUND], around[index + 3u * AROUND],
-            around[index + 4u * AROUND],
-        );
-    }
-    workgroupBarrier();
-    let x = part.x * SIDE + place.x;
-    let y = part.y * SIDE + place.y;
-    if x >= WIDTH || y >= HEIGHT {
+    let x = left + thread % ACROSS;
+    let first_y = top + thread / ACROSS * STRIP;
+    if thread >= ACROSS * STRIPS || x >= WIDTH || first_y >= HEIGHT {
         return;
     }
-    let first = place.y * AROUND + place.x;
-    let in_band = binomial(columns[first], columns[first + 1u], columns[first + 2u], columns[first + 3u], columns[first + 4u]);
-    let error = around[(place.y + REACH) * AROUND + place.x + REACH];
-    let index = plane + y * WIDTH + x;
-    let phasor = clipped(field[index]).value - error + CORRECTION_GAIN * in_band;
-    let phase = argument(phasor);
-    let turned = select(phase, phase + 2.0 * PI, phase < 0.0);
-    phases_rad[index] = select(turned, 0.0, turned >= 2.0 * PI);
+    var columns: array<u32, 5>;
+    for (var tap = 0u; tap < 5u; tap++) {
+        columns[tap] = mirrored(x + tap, WIDTH) + REACH - left;
+    }
+    // Rows of the filter: those before the first pixel's own, and one more for each pixel.
+    var rows: array<vec2f, 2 * REACH + 1>;
+    for (var row = 0u; row < 2u * REACH; row++) {
+        rows[row + 1u] = filtered_row(columns, first_y + row, top);
+    }
+    for (var row = 0u; row < STRIP; row++) {
+        let y = first_y + row;
+        for (var tap = 0u; tap < 2u * REACH; tap++) {
+            rows[tap] = rows[tap + 1u];
+        }
+        rows[2u * REACH] = filtered_row(columns, y + 2u * REACH, top);
+        if y < HEIGHT {
+            let in_band = binomial(rows[0], rows[1], rows[2], rows[3], rows[4]);
+            let error = errors[(y + REACH - top) * ERRORS_ACROSS + columns[REACH]];
+            let index = (part.z * HEIGHT + y) * WIDTH + x;
+            let phasor = clipped(loaded(field[index])).value - error + CORRECTION_GAIN * in_band;
+            let phase = argument(phasor);
+            let turned = select(phase, phase + 2.0 * PI, phase < 0.0);
+            phases_rad[index] = select(turned, 0.0, turned >= 2.0 * PI);
+        }
+    }
 }

@@ -3,7 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use half::f16;
 use holod_calibration::{DisplayGeometry, LevelTables, PupilDiameter};
+use num_complex::Complex32;
 use wgpu::{BufferUsages, QuerySet};
 
 use super::conv::Method;
@@ -11,7 +13,7 @@ use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
 use super::map::Format;
 use super::network::NetworkPlan;
-use super::plan::{BufferId, Plan, Stage};
+use super::plan::{Plan, Stage};
 use super::shared::pupil_values;
 use super::trunk::Features;
 use crate::engine::{EngineError, Precision, StageTiming, StageTimings, check_pupil};
@@ -278,7 +280,23 @@ impl GpuEngine {
     /// Where `hologram` has another size.
     pub fn read_hologram(&self, hologram: &mut ComplexHologram) -> Result<(), GpuError> {
         assert_eq!(hologram.resolution, self.network.shared.resolution, "a hologram of the engine's size");
-        self.read_complex(self.network.shared.field, &mut hologram.field)
+        let field = self.loaded.buffer(self.network.shared.field);
+        match self.network.shared.stored {
+            Precision::Single => {
+                let mut pairs = vec![[0.0f32; 2]; hologram.field.len()];
+                self.gpu.read(field, &mut pairs)?;
+                hologram.field.iter_mut().zip(pairs).for_each(|(value, [re, im])| *value = Complex32::new(re, im));
+            }
+            Precision::Half => {
+                let mut pairs = vec![[0u16; 2]; hologram.field.len()];
+                self.gpu.read(field, &mut pairs)?;
+                for (value, pair) in hologram.field.iter_mut().zip(pairs) {
+                    let [re, im] = pair.map(|bits| f16::from_bits(bits).to_f32());
+                    *value = Complex32::new(re, im);
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Copies the last frame's phases, after double phase, to the host.
@@ -291,15 +309,6 @@ impl GpuEngine {
     pub fn read_pattern(&self, pattern: &mut PhasePattern) -> Result<(), GpuError> {
         assert_eq!(pattern.resolution, self.network.shared.resolution, "a pattern of the engine's size");
         self.gpu.read(self.loaded.buffer(self.network.phases), &mut pattern.phase_rad)
-    }
-
-    pub(super) fn read_complex(&self, id: BufferId, values: &mut [num_complex::Complex32]) -> Result<(), GpuError> {
-        let mut pairs = vec![[0.0f32; 2]; values.len()];
-        self.gpu.read(self.loaded.buffer(id), &mut pairs)?;
-        for (value, [re, im]) in values.iter_mut().zip(pairs) {
-            *value = num_complex::Complex32::new(re, im);
-        }
-        Ok(())
     }
 
     /// As if the driver had lost the device: what a test of recovery asks for.

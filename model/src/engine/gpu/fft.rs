@@ -9,6 +9,7 @@ use holod_fft::{FftDirection, Real};
 use num_complex::{Complex32, Complex64};
 
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan, Shader};
+use crate::engine::Precision;
 use crate::gpu::GpuError;
 
 /// Prime factors that passes do without chirps.
@@ -48,15 +49,22 @@ pub(crate) struct LineFft {
     radices: Vec<usize>,
     /// `turns` of `fft.wgsl`.
     turns: BufferId,
+    /// Of the complex numbers in buffers.
+    stored: Precision,
     limits: WorkgroupLimits,
 }
 
 impl LineFft {
-    /// For lines of `length` samples, on a device with these `limits`.
+    /// For lines of `length` samples that lie in buffers as `stored`, on a device with these `limits`.
     ///
     /// # Errors
     /// Not even one such line fits in a workgroup.
-    pub(crate) fn new(plan: &mut Plan, length: usize, limits: WorkgroupLimits) -> Result<Self, GpuError> {
+    pub(crate) fn new(
+        plan: &mut Plan,
+        length: usize,
+        stored: Precision,
+        limits: WorkgroupLimits,
+    ) -> Result<Self, GpuError> {
         let span = match consists_of(length, &PRIMES) {
             true => length,
             false => {
@@ -75,7 +83,7 @@ impl LineFft {
         }
         let turns: Vec<_> = turns.iter().map(|turn| [turn.re as f32, turn.im as f32]).collect();
         let turns = plan.table("turns of a transform", &turns);
-        Ok(Self { length, span, radices, turns, limits })
+        Ok(Self { length, span, radices, turns, stored, limits })
     }
 
     /// Workgroups for rows, whose threads hold `items` samples, or more where there are not threads enough.
@@ -288,17 +296,19 @@ impl Lines {
         files: &[&str],
         entry: &'static str,
     ) -> Arc<Shader> {
-        let Self { fft: LineFft { length, span, radices, .. }, lines, threads } = self;
-        let own: [(&str, Constant); 5] = [
+        let Self { fft: LineFft { length, span, radices, stored, .. }, lines, threads } = self;
+        let own: [(&str, Constant); 6] = [
             ("LENGTH", (*length).into()),
             ("SPAN", (*span).into()),
             ("LINES", (*lines).into()),
             ("THREADS", (*threads).into()),
             ("BLUESTEIN", (span != length).into()),
+            ("UNITARY", ((*length as f64).powf(-0.5) as f32).into()),
         ];
         // A directive comes before all else.
         let directive = if files.iter().any(|file| file.starts_with(ENABLE_F16)) { ENABLE_F16 } else { "" };
         let mut source = String::from(directive);
+        source.push_str(stored.complex());
         source.push_str(include_str!("fft.wgsl"));
         let different: BTreeSet<_> = radices.iter().copied().collect();
         // Those of larger radices are made of those of smaller ones.
@@ -372,7 +382,7 @@ mod tests {
         direction: f32,
     ) -> [Vec<Complex64>; 2] {
         let mut plan = Plan::default();
-        let lines = lines(&LineFft::new(&mut plan, length, LIMITS).expect("it fits"));
+        let lines = lines(&LineFft::new(&mut plan, length, Precision::Single, LIMITS).expect("it fits"));
         let (from, to) =
             (plan.buffer::<[f32; 2]>("from", length * height), plan.buffer::<[f32; 2]>("to", length * height));
         let constants = [("HEIGHT", height.into()), ("DIRECTION", direction.into())];
@@ -383,7 +393,7 @@ mod tests {
         let mut values = noise(length * height);
         trial.write(from, &values.iter().flat_map(|value| [value.re as f32, value.im as f32]).collect::<Vec<_>>());
         trial.run();
-        let found = complex(&trial.read(to));
+        let found = complex(Precision::Single, &trial.read(to));
         let direction = if direction > 0.0 { FftDirection::Forward } else { FftDirection::Inverse };
         f64::plan(length, direction).process(&mut values);
         [found, values]
@@ -421,7 +431,7 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_told_with_its_size_and_the_limit() {
         let limits = WorkgroupLimits { bytes: 16 << 10, threads: 128 };
-        let new = |length| LineFft::new(&mut Plan::default(), length, limits).map(drop);
+        let new = |length| LineFft::new(&mut Plan::default(), length, Precision::Single, limits).map(drop);
         assert_eq!(new(2048), Ok(()));
         assert_eq!(new(1021), Ok(()));
         // Of 2053 samples, a prime, the chirps need 4105 at least, and 4320 has no factor but 2, 3 and 5.
@@ -450,7 +460,11 @@ mod tests {
             (1920, 1920),
             (1080, 1080),
         ] {
-            assert_eq!(LineFft::new(&mut Plan::default(), length, LIMITS).expect("it fits").span, span, "{length}");
+            assert_eq!(
+                LineFft::new(&mut Plan::default(), length, Precision::Single, LIMITS).expect("it fits").span,
+                span,
+                "{length}"
+            );
         }
     }
 
@@ -468,7 +482,7 @@ mod tests {
         for threads in [128, 256, 1024] {
             let limits = WorkgroupLimits { threads, ..LIMITS };
             for length in 1..=2048 {
-                let fft = LineFft::new(&mut Plan::default(), length, limits).expect("it fits");
+                let fft = LineFft::new(&mut Plan::default(), length, Precision::Single, limits).expect("it fits");
                 for lines in [fft.rows(4), fft.columns(5), fft.columns(9)] {
                     assert!(lines.lines * fft.span * SAMPLE_BYTES <= limits.bytes as usize);
                     assert!(lines.threads <= threads as usize && lines.threads.is_multiple_of(WAVE));

@@ -5,8 +5,11 @@
 // p is sample p / LINES of line p % LINES. Nothing else has to be waited for around `transform`. Lines beyond the last
 // one may hold anything.
 //
-// Before this file: LENGTH, SPAN, LINES, THREADS and BLUESTEIN. After it: the other butterflies, a pass for each radix,
-// and `passes`, as fft.rs writes them.
+// UNITARY times a transform keeps the sum of squares: what buffers hold between passes is made of such transforms, so
+// that its numbers are about as large as the field's.
+//
+// Before this file: LENGTH, SPAN, LINES, THREADS, BLUESTEIN, UNITARY, and how buffers hold complex numbers. After it:
+// the other butterflies, a pass for each radix, and `passes`, as fft.rs writes them.
 
 const PLACES = LENGTH * LINES;
 const ITEMS = (PLACES + THREADS - 1u) / THREADS;

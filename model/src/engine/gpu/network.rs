@@ -52,7 +52,7 @@ impl NetworkPlan {
         };
         let size = Resolution { width: resolution.width.div_ceil(scale), height: resolution.height.div_ceil(scale) };
         let mut plan = Plan::default();
-        let shared = Shared::new(&mut plan, resolution, size);
+        let shared = Shared::new(&mut plan, resolution, size, features.format.precision());
         let mut modulated = Vec::new();
         let mut net = |plan: &mut Plan, prefix: &str, layers: &[_], input: &_, channels: Vec<usize>| {
             let (output, more) = trunk::run(plan, prefix, layers, config.leaky_slope, features, input, &channels);
@@ -72,9 +72,9 @@ impl NetworkPlan {
                 let stack = ExpectedStack::expect(&mut plan, config, bench, &shared, &inputs, limits)?;
                 let lights = net(&mut plan, "lighting ", lighting, &inputs, channels.lighting());
                 stack.light(&mut plan, &lights);
-                stack.feed_back(&mut plan, *feedback, &inputs);
+                stack.feed_back(&mut plan, *feedback);
                 let residual = net(&mut plan, "correction ", correction, &inputs, channels.correction());
-                let low = Low::Corrected(stack.carried(), &residual);
+                let low = Low::Corrected { inputs: &inputs, channels, correction: &residual };
                 upsample::field(&mut plan, &shared, config.grid, low, limits)?;
             }
             Family::FocalStack { .. } => return Err(EngineError::takes_focal_stacks()),

@@ -64,7 +64,7 @@ fn phase_error(actual: &[f32], expected: &[f32], tolerance_rad: f32) -> (f32, us
 /// Phases, and each colour's count of clipped samples, on the device.
 fn encoded_on_gpu(hologram: &ComplexHologram, constant: f32) -> (Vec<f32>, [u32; 3]) {
     let mut plan = Plan::default();
-    let shared = Shared::new(&mut plan, hologram.resolution, hologram.resolution);
+    let shared = Shared::new(&mut plan, hologram.resolution, hologram.resolution, Precision::Single);
     let clipped = plan.buffer::<u32>("clipped samples", 3);
     let phases = double_phase::encode(&mut plan, &shared, constant, clipped);
     let trial = Trial::new(&plan);

@@ -157,7 +157,16 @@ impl Map {
 }
 
 /// What a buffer of complex numbers holds.
-pub(super) fn complex(values: &[f32]) -> Vec<Complex64> {
+pub(super) fn complex(stored: Precision, values: &[f32]) -> Vec<Complex64> {
+    let halves: Vec<f32>;
+    let values = match stored {
+        Precision::Single => values,
+        Precision::Half => {
+            let bits: &[u16] = bytemuck::cast_slice(values);
+            halves = bits.iter().map(|&bits| f16::from_bits(bits).to_f32()).collect();
+            &halves
+        }
+    };
     values.chunks_exact(2).map(|parts| Complex64::new(parts[0].into(), parts[1].into())).collect()
 }
 

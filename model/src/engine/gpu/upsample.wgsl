@@ -4,15 +4,13 @@
 // spectrum that is turned by a quarter of a sample each way and transformed back gives every second pixel, and nothing
 // longer than a line of samples is ever transformed.
 //
-// Before this file: fft.wgsl and the constants of upsample.rs.
+// Before this file: fft.wgsl, the constants of upsample.rs and what has `low`.
 
-@group(0) @binding(1) var<storage, read> base: array<vec2f>; // [3, height, width]
-// The correction: three real parts and three imaginary ones.
-@group(0) @binding(2) var<storage, read> correction: array<vec4f>;
-@group(0) @binding(3) var<storage, read_write> small: array<vec2f>; // [3, height, width]
-@group(0) @binding(4) var<storage, read_write> tall: array<vec2f>; // [3, frame height, width]
-@group(0) @binding(5) var<storage, read_write> field: array<vec2f>; // [3, frame height, frame width]
-// Of each bin of a line: the turn that leads a quarter of a sample back, over the number of samples; zero at Nyquist.
+@group(0) @binding(3) var<storage, read_write> small: array<Stored>; // [3, height, width]
+@group(0) @binding(4) var<storage, read_write> tall: array<Stored>; // [3, frame height, width]
+@group(0) @binding(5) var<storage, read_write> field: array<Stored>; // [3, frame height, frame width]
+// Of each bin of a line: the turn that leads a quarter of a sample back, over the number of samples, or its root where
+// the spectrum is one of a unitary transform; zero at Nyquist.
 @group(0) @binding(6) var<storage, read> quarter: array<vec2f>;
 
 // The turn of bin `bin` to the first pixel of each sample, or the second.
@@ -25,28 +23,20 @@ fn to_pixel(bin: u32, second: u32) -> vec2f {
 @compute @workgroup_size(THREADS)
 fn correct(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
-    var real: array<vec3f, ITEMS>;
-    var imaginary: array<vec3f, ITEMS>;
-    if (CORRECTS) {
-        for (var item = 0u; item < ITEMS; item++) {
-            let place = item * THREADS + thread;
-            let y = group.x * LINES + place % LINES;
-            if (place < PLACES && y < HEIGHT) {
-                let first = (y + 1u) * CORRECTION_GROUPS * CORRECTION_PITCH + place / LINES + 1u;
-                let head = correction[first];
-                let tail = correction[first + CORRECTION_PITCH];
-                real[item] = CORRECTION_SHARE * head.xyz;
-                imaginary[item] = CORRECTION_SHARE * vec3f(head.w, tail.xy);
-            }
+    var fields: array<array<vec2f, 3>, ITEMS>;
+    for (var item = 0u; item < ITEMS; item++) {
+        let place = item * THREADS + thread;
+        let y = group.x * LINES + place % LINES;
+        if (place < PLACES && y < HEIGHT) {
+            fields[item] = low(place / LINES, y);
         }
     }
     for (var colour = 0u; colour < 3u; colour++) {
         for (var item = 0u; item < ITEMS; item++) {
             let place = item * THREADS + thread;
-            let y = group.x * LINES + place % LINES;
-            if (place < PLACES && y < HEIGHT) {
-                let there = (colour * HEIGHT + y) * WIDTH + place / LINES;
-                line[place] = base[there] + vec2f(real[item][colour], imaginary[item][colour]);
+            if (place < PLACES) {
+                let of_two = select(fields[item][0], fields[item][1], colour == 1u);
+                line[place] = UNITARY * select(of_two, fields[item][2], colour == 2u);
             }
         }
         transform(FORWARD);
@@ -54,7 +44,7 @@ fn correct(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
             let place = item * THREADS + thread;
             let y = group.x * LINES + place % LINES;
             if (place < PLACES && y < HEIGHT) {
-                small[(colour * HEIGHT + y) * WIDTH + place / LINES] = line[place];
+                small[(colour * HEIGHT + y) * WIDTH + place / LINES] = stored(line[place]);
             }
         }
     }
@@ -69,7 +59,7 @@ fn double_columns(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation
         let place = item * THREADS + thread;
         let x = group.x * LINES + place % LINES;
         if (place < PLACES && x < WIDTH) {
-            line[place] = small[(colour * HEIGHT + place / LINES) * WIDTH + x];
+            line[place] = loaded(small[(colour * HEIGHT + place / LINES) * WIDTH + x]);
         }
     }
     transform(FORWARD);
@@ -93,7 +83,7 @@ fn double_columns(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation
             let x = group.x * LINES + place % LINES;
             let y = 2u * (place / LINES) + second;
             if (place < PLACES && x < WIDTH && y < FRAME_HEIGHT) {
-                tall[(colour * FRAME_HEIGHT + y) * WIDTH + x] = line[place];
+                tall[(colour * FRAME_HEIGHT + y) * WIDTH + x] = stored(line[place]);
             }
         }
     }
@@ -109,7 +99,7 @@ fn double_rows(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
         let place = item * THREADS + thread;
         let y = group.x * LINES + place % LINES;
         if (place < PLACES && y < FRAME_HEIGHT) {
-            spectrum[item] = tall[(colour * FRAME_HEIGHT + y) * WIDTH + place / LINES];
+            spectrum[item] = loaded(tall[(colour * FRAME_HEIGHT + y) * WIDTH + place / LINES]);
         }
     }
     var first: array<vec2f, ITEMS>;
@@ -130,9 +120,9 @@ fn double_rows(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
         let y = group.x * LINES + place % LINES;
         if (place < PLACES && y < FRAME_HEIGHT) {
             let there = (colour * FRAME_HEIGHT + y) * FRAME_WIDTH + x;
-            field[there] = first[item];
+            field[there] = stored(first[item]);
             if (x + 1u < FRAME_WIDTH) {
-                field[there + 1u] = line[place];
+                field[there + 1u] = stored(line[place]);
             }
         }
     }
