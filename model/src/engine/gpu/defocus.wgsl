@@ -110,8 +110,8 @@ fn opposite(place: u32) -> u32 {
     return (HEIGHT - place / LINES) % HEIGHT * LINES + place % LINES;
 }
 
-// Of one pair of a layer's light, along x, what is at `item` of the columns of a workgroup; nothing of pairs that follow
-// the last one.
+// Of one pair of a layer's light, along x, what is at `item` of the columns of a workgroup; nothing of pairs that
+// follow the last one.
 fn light_spectrum(layer_pair: u32, columns: u32, item: u32) -> Stored {
     let place = item * THREADS + thread;
     let x = columns * LINES + place % LINES;

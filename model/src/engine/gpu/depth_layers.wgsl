@@ -1,7 +1,7 @@
 // The light of the depth layers, and how it goes to the SLM plane, as depth_layers.rs and expected_stack.rs have it.
 //
-// Before this file: fft.wgsl, pupil.wgsl, transfer_tables.wgsl and the constants of depth_layers.rs. What lights the layers is in
-// light_of_layers.wgsl.
+// Before this file: fft.wgsl, pupil.wgsl, transfer_tables.wgsl and the constants of depth_layers.rs. What lights the
+// layers is in light_of_layers.wgsl.
 
 @group(0) @binding(3) var<storage, read_write> spectra: array<Stored>; // [layers, 3, height, width]
 // Transfer functions from one layer to the next nearer one, and from the nearest to the SLM plane, the latter times

@@ -1,5 +1,5 @@
-// Double phase; optics/double_phase.rs says what it does and why. After these constants, how buffers hold complex numbers
-// and phase_math.wgsl: WIDTH, HEIGHT, AMPLITUDE_SCALE, and those of double_phase.rs.
+// Double phase; optics/double_phase.rs says what it does and why. After these constants, how buffers hold complex
+// numbers, and phase_math.wgsl: WIDTH, HEIGHT, AMPLITUDE_SCALE, and those of double_phase.rs.
 
 @group(0) @binding(0) var<storage, read> field: array<Stored>; // [3, height, width]
 @group(0) @binding(1) var<storage, read_write> tile_powers: array<f32>; // [3, tiles down, tiles across]
@@ -88,12 +88,11 @@ var<workgroup> errors: array<vec2f, ERRORS_ACROSS * ERRORS_DOWN>;
 // Those of the block at (left, top), as far as they are needed.
 fn find_errors(left: u32, top: u32, colour: u32, block_x: u32, block_y: u32) {
     var a: array<vec2f, 16>;
+    let first = (colour * HEIGHT + top) * WIDTH + left;
     for (var pixel = 0u; pixel < 16u; pixel++) {
-        let x = left + pixel % 4u;
-        let y = top + pixel / 4u;
         a[pixel] = vec2f(0.0);
-        if x < WIDTH && y < HEIGHT {
-            a[pixel] = clipped(loaded(field[(colour * HEIGHT + y) * WIDTH + x])).value;
+        if left + pixel % 4u < WIDTH && top + pixel / 4u < HEIGHT {
+            a[pixel] = clipped(loaded(field[first + pixel / 4u * WIDTH + pixel % 4u])).value;
         }
     }
     let tile_power = tile_powers[(colour * TILES_DOWN + top / TILE) * TILES_ACROSS + left / TILE];
@@ -117,10 +116,11 @@ fn find_errors(left: u32, top: u32, colour: u32, block_x: u32, block_y: u32) {
         quarters[quarter] = unit(quarters[quarter] + floor * block);
     }
 
+    // Left of and above what is needed these wrap round to what is too large.
+    let first_x = block_x * BLOCK + REACH - BLOCK;
+    let first_y = block_y * BLOCK + REACH - BLOCK;
+    let first_error = first_y * ERRORS_ACROSS + first_x;
     for (var pixel = 0u; pixel < 16u; pixel++) {
-        // Left of and above what is needed these wrap round to what is too large.
-        let x = block_x * BLOCK + pixel % 4u + REACH - BLOCK;
-        let y = block_y * BLOCK + pixel / 4u + REACH - BLOCK;
         let value = a[pixel];
         // The carrier at its own length.
         let carrier = dot(value, value) * value + floor * quarters[pixel / 8u * 2u + pixel % 4u / 2u];
@@ -128,8 +128,8 @@ fn find_errors(left: u32, top: u32, colour: u32, block_x: u32, block_y: u32) {
         let along = dot(value, carrier);
         let across = sqrt(max(square - along * along, 0.0));
         let pair = vec2f(along, select(-across, across, (pixel % 4u + pixel / 4u) % 2u == 1u));
-        if x < ERRORS_ACROSS && y < ERRORS_DOWN {
-            errors[y * ERRORS_ACROSS + x] = value - times(carrier, pair) / square;
+        if first_x + pixel % 4u < ERRORS_ACROSS && first_y + pixel / 4u < ERRORS_DOWN {
+            errors[first_error + pixel / 4u * ERRORS_ACROSS + pixel % 4u] = value - times(carrier, pair) / square;
         }
     }
 }
@@ -149,8 +149,8 @@ fn binomial(a: vec2f, b: vec2f, c: vec2f, d: vec2f, e: vec2f) -> vec2f {
     return 0.375 * c + 0.25 * (b + d) + 0.0625 * (a + e);
 }
 
-// Row `padded` - REACH of the errors through the filter, around these columns. Beyond the last row that one of the image
-// needs, all are that one.
+// Row `padded` - REACH of the errors through the filter, around these columns. Beyond the last row that one of the
+// image needs, all are that one.
 fn filtered_row(columns: array<u32, 5>, padded: u32, top: u32) -> vec2f {
     let row = mirrored(min(padded, HEIGHT + 2u * REACH - 1u), HEIGHT) + REACH - top;
     let first = row * ERRORS_ACROSS;
@@ -191,6 +191,8 @@ fn phases(@builtin(workgroup_id) part: vec3u, @builtin(local_invocation_index) t
     for (var row = 0u; row < 2u * REACH; row++) {
         rows[row + 1u] = filtered_row(columns, first_y + row, top);
     }
+    var error_place = (first_y + REACH - top) * ERRORS_ACROSS + columns[REACH];
+    var index = (part.z * HEIGHT + first_y) * WIDTH + x;
     for (var row = 0u; row < STRIP; row++) {
         let y = first_y + row;
         for (var tap = 0u; tap < 2u * REACH; tap++) {
@@ -199,12 +201,12 @@ fn phases(@builtin(workgroup_id) part: vec3u, @builtin(local_invocation_index) t
         rows[2u * REACH] = filtered_row(columns, y + 2u * REACH, top);
         if y < HEIGHT {
             let in_band = binomial(rows[0], rows[1], rows[2], rows[3], rows[4]);
-            let error = errors[(y + REACH - top) * ERRORS_ACROSS + columns[REACH]];
-            let index = (part.z * HEIGHT + y) * WIDTH + x;
-            let phasor = clipped(loaded(field[index])).value - error + CORRECTION_GAIN * in_band;
+            let phasor = clipped(loaded(field[index])).value - errors[error_place] + CORRECTION_GAIN * in_band;
             let phase = argument(phasor);
             let turned = select(phase, phase + 2.0 * PI, phase < 0.0);
             phases_rad[index] = select(turned, 0.0, turned >= 2.0 * PI);
         }
+        error_place += ERRORS_ACROSS;
+        index += WIDTH;
     }
 }

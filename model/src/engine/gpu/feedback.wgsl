@@ -64,8 +64,8 @@ fn wanted_amplitude(channel: u32, x: u32, y: u32) -> f32 {
     return expected(channel, x, y);
 }
 
-// Rows of the light at LAYERS_TOGETHER layers: from spectra along x to those of the change that would give what it lacks,
-// which goes to the map.
+// Rows of the light at LAYERS_TOGETHER layers: from spectra along x to those of the change that would give what it
+// lacks, which goes to the map.
 @compute @workgroup_size(THREADS)
 fn compare(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;

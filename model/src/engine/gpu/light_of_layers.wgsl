@@ -1,5 +1,5 @@
-// The light that the depth layers send out. Before this file: fft.wgsl, phase_math.wgsl, expected.wgsl, the constants of
-// depth_layers.rs and what the map of the first net's outputs declares as `output`.
+// The light that the depth layers send out. Before this file: fft.wgsl, phase_math.wgsl, expected.wgsl, the constants
+// of depth_layers.rs and what the map of the first net's outputs declares as `output`.
 
 // The first net's: for each layer a group of three phases over π and a mask, then the changes of the amplitudes.
 @group(0) @binding(1) var<storage, read> outputs: array<output_vector>;

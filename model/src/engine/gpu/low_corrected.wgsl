@@ -1,5 +1,5 @@
-// The field on the network's grid as the `expected-stack` family has it: what the second net reads of it, and a share of
-// what that gives. Before this file: FIELD_GROUP, CORRECTION_SHARE and what both maps declare.
+// The field on the network's grid as the `expected-stack` family has it: what the second net reads of it, and a share
+// of what that gives. Before this file: FIELD_GROUP, CORRECTION_SHARE and what both maps declare.
 
 // Each has three real parts and three imaginary ones in two groups.
 @group(0) @binding(1) var<storage, read> inputs: array<input_vector>;

@@ -58,22 +58,19 @@ pub(crate) fn field(
 
     let complex = (2 * stored.bytes() * size.pixels()) as u64;
     let mut constants = grid_constants(frame, size).to_vec();
-    let (mut bindings, read, source) = match low {
-        Low::Field(field) => (vec![(1, field)], 3 * complex, include_str!("low_field.wgsl").to_owned()),
+    let (mut bindings, read, declared, source) = match low {
+        Low::Field(field) => (vec![(1, field)], 3 * complex, vec![], include_str!("low_field.wgsl")),
         Low::Corrected { inputs, channels, correction } => {
             let own: [(&str, Constant); 2] =
                 [("FIELD_GROUP", (channels.field / GROUP).into()), ("CORRECTION_SHARE", CORRECTION_SHARE.into())];
             constants.extend(own);
-            let source = [
-                inputs.declaration("input"),
-                correction.declaration("correction"),
-                include_str!("low_corrected.wgsl").to_owned(),
-            ];
+            let declared = vec![inputs.declaration("input"), correction.declaration("correction")];
             let groups = [inputs, correction].map(|map| 2 * PlaneBytes::new(shared, map.format).group);
-            (vec![(1, inputs.buffer), (2, correction.buffer)], groups.iter().sum(), source.concat())
+            let bindings = vec![(1, inputs.buffer), (2, correction.buffer)];
+            (bindings, groups.iter().sum(), declared, include_str!("low_corrected.wgsl"))
         }
     };
-    let files = [&source, include_str!("upsample.wgsl")];
+    let files: Vec<_> = declared.iter().map(String::as_str).chain([source, include_str!("upsample.wgsl")]).collect();
     let shader = |lines: &Lines, entry| lines.shader(&format!("upsample: {entry}"), &constants, &files, entry);
     let stage = plan.stages.last_mut().expect("the stage `field`");
     bindings.extend([rows.turns(), (3, small)]);
