@@ -15,10 +15,13 @@ use crate::weights::{CONDITIONS, NetworkConfig};
 
 /// Foci whose spectra a thread holds at once; where there are more layers, these are transformed anew for each so many.
 const MOST_FOCI: usize = 8;
-/// Samples of each of these that a thread holds.
-const BLUR_ITEMS: usize = 4;
+/// Pairs of opposite bins that a thread holds of each of these: of the most, and of half as many.
+const BLUR_PAIRS: usize = 2;
+const BLUR_PAIRS_OF_FEW: usize = 3;
+/// The largest radix of a thread that holds so many.
+const BLUR_RADIX: usize = 12;
 /// Samples that a thread holds of the rows of a frame, and of what is seen.
-const FRAME_ITEMS: usize = 6;
+const FRAME_ITEMS: usize = 5;
 const ROW_ITEMS: usize = 8;
 
 /// Planes of complex numbers on the network's grid that the stage needs as scratch.
@@ -44,6 +47,7 @@ pub(super) fn expect(
     let disc_table = plan.table("the spectrum of a disc", &disc.values);
 
     let foci = count.min(MOST_FOCI);
+    let blurred = grid.columns.with_radices_up_to(BLUR_RADIX);
     let channels = InputChannels::new(count, inputs.format);
     let constants: Vec<(&str, Constant)> = grid_constants(shared.resolution, size)
         .into_iter()
@@ -52,8 +56,8 @@ pub(super) fn expect(
             ("PAIRS", PAIRS.into()),
             ("LEAST_COVER", LEAST_COVER.into()),
             ("FOCI", foci.into()),
-            // In single precision 3 registers would spill, of 8 layers on RDNA 3.
-            ("ASKS_EARLY", (shared.stored == Precision::Half).into()),
+            // Elsewhere up to 3 registers would spill, of 8 layers on RDNA 3.
+            ("ASKS_EARLY", (shared.stored == Precision::Half && blurred.largest_radix() <= 10).into()),
             ("FIRST_SEEN", (scratch_planes(count) - PAIRS * count).into()),
             ("LAYERS_TOGETHER", layers_together(count).into()),
             ("STACK_GROUP", (channels.stack / GROUP).into()),
@@ -65,7 +69,8 @@ pub(super) fn expect(
     let features = include_str!("input_features.wgsl");
     let files = [&declared, include_str!("blocks.wgsl"), features, include_str!("defocus.wgsl")];
     let shader = |lines: &Lines, entry| lines.shader(&format!("defocus: {entry}"), &constants, &files, entry);
-    let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(BLUR_ITEMS));
+    let pairs = if 2 * foci <= MOST_FOCI { BLUR_PAIRS_OF_FEW } else { BLUR_PAIRS };
+    let (rows, columns) = (grid.rows.rows(ROW_ITEMS), blurred.mirrored_columns(pairs));
     let frame_rows = grid.rows.rows(FRAME_ITEMS);
     let (row_groups, column_groups) = (rows.workgroups(size.height), columns.workgroups(size.width));
     let PlaneBytes { byte, complex, group, .. } = PlaneBytes::new(shared, inputs.format);

@@ -15,6 +15,8 @@ use crate::weights::{Feedback, NetworkConfig};
 /// Samples that a thread holds of a row, and of a column.
 const ROW_ITEMS: usize = 8;
 const COLUMN_ITEMS: usize = 9;
+/// The largest radix of a thread that compares so many.
+const COMPARE_RADIX: usize = 15;
 /// Samples of a row that a thread holds of all colours of two fields.
 const CHANGE_ITEMS: usize = 6;
 
@@ -53,9 +55,9 @@ pub(super) fn feed_back(
     let files =
         [&expected, include_str!("pupil.wgsl"), include_str!("transfer_tables.wgsl"), include_str!("feedback.wgsl")];
     let shader = |lines: &Lines, entry| lines.shader(&format!("feedback: {entry}"), &constants, &files, entry);
-    let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(COLUMN_ITEMS));
+    let columns = grid.columns.columns(COLUMN_ITEMS);
+    let compared_rows = grid.rows.with_radices_up_to(COMPARE_RADIX).rows(ROW_ITEMS);
     let change_rows = grid.rows.rows(CHANGE_ITEMS);
-    let row_groups = rows.workgroups(size.height);
     let PlaneBytes { byte, complex, real, group } = PlaneBytes::new(shared, inputs.format);
     let (planes, batches) = (3 * count as u64, count / layers_together(count));
     let stage = plan.stage("feedback", 0);
@@ -73,9 +75,9 @@ pub(super) fn feed_back(
     );
     send.bytes = Some((3 + planes) * complex + 2 * table_bytes(size));
     let compare = stage.dispatch_with(
-        shader(&rows, "compare"),
-        &[rows.turns(), (5, grid.spectra), (6, layers.stack), (7, layer_of), (10, inputs.buffer)],
-        [row_groups, batches, 1],
+        shader(&compared_rows, "compare"),
+        &[compared_rows.turns(), (5, grid.spectra), (6, layers.stack), (7, layer_of), (10, inputs.buffer)],
+        [compared_rows.workgroups(size.height), batches, 1],
     );
     let lacking = planes.div_ceil(4) * group;
     let wanted = if config.refined_stack { planes * real } else { lacking };

@@ -71,7 +71,7 @@ impl LineFft {
                 (2 * length - 1..).find(|&span| consists_of(span, &PRIMES[..SMALL_PRIMES])).expect("powers of 2 are")
             }
         };
-        let radices = radices(span);
+        let radices = radices(span, MOST_RADIX);
         let bytes = span * SAMPLE_BYTES;
         if bytes > limits.bytes as usize {
             return Err(GpuError::LineTooLong { samples: length, bytes, limit: limits.bytes as usize });
@@ -86,6 +86,15 @@ impl LineFft {
         Ok(Self { length, span, radices, turns, stored, limits })
     }
 
+    /// The same with radices up to `most`, and what passes have to do, for threads that need registers for more.
+    pub(crate) fn with_radices_up_to(&self, most: usize) -> Self {
+        Self { radices: radices(self.span, most), ..self.clone() }
+    }
+
+    pub(crate) fn largest_radix(&self) -> usize {
+        self.radices.iter().copied().max().unwrap_or(1)
+    }
+
     /// Workgroups for rows, whose threads hold `items` samples, or more where there are not threads enough.
     pub(crate) fn rows(&self, items: usize) -> Lines {
         self.lines(items, |lines| lines * self.span <= SAMPLES_OF_ROWS)
@@ -94,6 +103,13 @@ impl LineFft {
     /// The same for columns, of which neighbours are taken together as far as their memory and threads go.
     pub(crate) fn columns(&self, items: usize) -> Lines {
         self.lines(items, |lines| lines * self.length <= items * self.most_threads())
+    }
+
+    /// The same, whose threads hold `pairs` pairs of opposite bins.
+    pub(crate) fn mirrored_columns(&self, pairs: usize) -> Lines {
+        let lines = self.columns(2 * pairs);
+        let threads = (lines.lines * (self.length / 2 + 1)).div_ceil(pairs).next_multiple_of(WAVE);
+        Lines { threads: threads.min(self.most_threads()), ..lines }
     }
 
     fn most_threads(&self) -> usize {
@@ -124,8 +140,8 @@ fn consists_of(length: usize, primes: &[usize]) -> bool {
 
 /// The radices of a transform of `length`, which has small prime factors only: as few passes as there can be, the first
 /// of an odd radix where it can be, which spreads its stores over the banks of a workgroup's memory, and radices as
-/// small as they can be.
-fn radices(length: usize) -> Vec<usize> {
+/// small as they can be. None is above `most` but primes.
+fn radices(length: usize, most: usize) -> Vec<usize> {
     let mut best: Option<Vec<usize>> = None;
     let mut begun = vec![(length, Vec::new())];
     while let Some((rest, radices)) = begun.pop() {
@@ -140,8 +156,9 @@ fn radices(length: usize) -> Vec<usize> {
             continue;
         }
         // What follows the first radix does so in one order.
-        let most = if radices.len() < 2 { MOST_RADIX } else { radices[radices.len() - 1] };
-        for radix in (2..=most).filter(|&radix| rest.is_multiple_of(radix)) {
+        let last = if radices.len() < 2 { MOST_RADIX } else { radices[radices.len() - 1] };
+        let suits = |radix: &usize| rest.is_multiple_of(*radix) && (*radix <= most || PRIMES.contains(radix));
+        for radix in (2..=last).filter(suits) {
             begun.push((rest / radix, [&radices[..], &[radix]].concat()));
         }
     }
@@ -415,7 +432,7 @@ mod tests {
             for direction in [1.0, -1.0] {
                 let lines = |fft: &LineFft| match index % 3 {
                     0 => fft.rows(4),
-                    1 => fft.columns(5),
+                    1 => fft.with_radices_up_to(12).mirrored_columns(2),
                     _ => fft.columns(9),
                 };
                 let mut both = transformed((length, 11), lines, direction);
@@ -473,8 +490,11 @@ mod tests {
         let known: [(usize, &[usize]); 5] =
             [(1, &[]), (8, &[8]), (540, &[9, 10, 6]), (960, &[15, 8, 8]), (2080, &[13, 16, 10])];
         for (length, expected) in known {
-            assert_eq!(radices(length), expected, "{length}");
+            assert_eq!(radices(length, MOST_RADIX), expected, "{length}");
         }
+        assert_eq!(radices(540, 12), [9, 10, 6]);
+        assert_eq!(radices(256, 12).iter().max(), Some(&8));
+        assert_eq!(radices(13 * 16, 12).iter().max(), Some(&13), "a prime has no smaller ones");
     }
 
     #[test]
@@ -483,7 +503,8 @@ mod tests {
             let limits = WorkgroupLimits { threads, ..LIMITS };
             for length in 1..=2048 {
                 let fft = LineFft::new(&mut Plan::default(), length, Precision::Single, limits).expect("it fits");
-                for lines in [fft.rows(4), fft.columns(5), fft.columns(9)] {
+                let blurred = fft.with_radices_up_to(12).mirrored_columns(2);
+                for lines in [fft.rows(4), fft.columns(5), fft.columns(9), blurred] {
                     assert!(lines.lines * fft.span * SAMPLE_BYTES <= limits.bytes as usize);
                     assert!(lines.threads <= threads as usize && lines.threads.is_multiple_of(WAVE));
                     assert!(lines.lines.is_power_of_two());
