@@ -32,7 +32,6 @@ pub(super) fn scratch_planes(depth_layers: usize) -> usize {
 
 /// Adds the stage `expected stack`, which writes the layers of each block's corners, and to `inputs` what the first net
 /// reads.
-#[expect(clippy::too_many_arguments)]
 pub(super) fn expect(
     plan: &mut Plan,
     config: &NetworkConfig,
