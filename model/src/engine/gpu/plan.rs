@@ -86,7 +86,7 @@ impl Shader {
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Constant {
     U32(u32),
-    /// Finite.
+    /// A finite number.
     F32(f32),
     Bool(bool),
 }

@@ -22,7 +22,7 @@ const COLUMN_ITEMS: usize = 9;
 /// A field on the network's grid.
 #[derive(Clone, Copy)]
 pub(crate) enum Low<'a> {
-    /// [3, height, width]
+    /// [3, height, width] of complex numbers.
     Field(BufferId),
     /// What the second net reads, with its channels, and what that gives, of which a share is added.
     Corrected { inputs: &'a Map, channels: InputChannels, correction: &'a Map },

@@ -38,7 +38,7 @@ pub use self::null_device::serve;
 /// The argument with which a [`Compiler`] starts its program, which then calls [`serve`].
 pub const SERVE: &str = "--serve-null-device";
 
-/// A graphics card.
+/// A graphics card, as the model of its cost knows it.
 #[derive(Clone, Copy, Debug)]
 pub struct Card {
     /// As it is sold.
@@ -104,7 +104,7 @@ pub enum CostError {
 /// What one frame costs on one card.
 #[derive(Clone, Debug, Serialize)]
 pub struct FrameCost {
-    /// The card.
+    /// The card's name, as in [`Card`].
     pub card: &'static str,
     /// In the order in which they run.
     pub stages: Vec<StageCost>,
@@ -113,18 +113,18 @@ pub struct FrameCost {
 /// What one stage costs.
 #[derive(Clone, Debug, Serialize)]
 pub struct StageCost {
-    /// The stage's name.
+    /// As in [`StageTiming`](crate::engine::StageTiming).
     pub name: String,
     /// Operations of its definition, two to a multiply-add; 0 where it is no matrix-like work.
     pub flop: u64,
-    /// One after another.
+    /// In the order in which they run, none beside another.
     pub dispatches: Vec<DispatchCost>,
 }
 
 /// What one dispatch costs.
 #[derive(Clone, Debug, Serialize)]
 pub struct DispatchCost {
-    /// The shader's label.
+    /// The shader's label, which [`Compiler::assembly`] takes.
     pub shader: String,
     /// Vector registers of a thread.
     pub vector_registers: u64,
@@ -189,7 +189,7 @@ impl DispatchCost {
         self.arithmetic_s().max(self.bytes_s)
     }
 
-    /// By instructions.
+    /// By instructions: of vectors or of the workgroup's memory, whichever takes longer.
     pub fn arithmetic_s(&self) -> f64 {
         self.vector_s.max(self.workgroup_memory_s)
     }
