@@ -15,10 +15,10 @@ use crate::weights::{CONDITIONS, NetworkConfig};
 
 /// Foci whose spectra a thread holds at once; where there are more layers, these are transformed anew for each so many.
 const MOST_FOCI: usize = 8;
-/// Pairs of opposite bins that a thread holds of each of these: of the most, and of half as many.
+/// Pairs of opposite bins that a thread holds of each of [`MOST_FOCI`], and of each of half as many or fewer.
 const BLUR_PAIRS: usize = 2;
 const BLUR_PAIRS_OF_FEW: usize = 3;
-/// The largest radix of a thread that holds so many.
+/// The largest radix of a thread that holds so many, but for primes.
 const BLUR_RADIX: usize = 12;
 /// Samples that a thread holds of the rows of a frame, and of what is seen.
 const FRAME_ITEMS: usize = 5;

@@ -1,7 +1,8 @@
 // What an eye should see at each depth layer, as defocus.rs computes it: every layer's light is blurred by its disc of
 // confusion at the focus on each other one, and the sum is divided by that of a white scene.
 //
-// Before this file: fft.wgsl, blocks.wgsl, input_features.wgsl and the constants of defocus.rs.
+// Before this file: fft.wgsl, blocks.wgsl, input_features.wgsl, the constants of defocus.rs, and what the nets' map
+// declares as `input`.
 
 @group(0) @binding(1) var<storage, read> frame: array<f32>; // [4, frame height, frame width]
 @group(0) @binding(2) var<storage, read> pupil: Pupil;
@@ -92,7 +93,8 @@ fn take_layers(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
     }
 }
 
-// The spectrum of a disc, 2·J1(x)/x, of layers so far apart, at `place` of the columns of a workgroup.
+// The spectrum of a disc, 2·J1(x)/x, of layers that are `apart` layers apart, at `place` of the columns of workgroup
+// `columns`.
 fn disc(apart: f32, columns: u32, place: u32) -> f32 {
     const LAST = DISC_ENTRIES - 1u;
     let f = vec2f(frequency(columns * LINES + place % LINES, WIDTH), frequency(place / LINES, HEIGHT));
@@ -110,8 +112,8 @@ fn opposite(place: u32) -> u32 {
     return (HEIGHT - place / LINES) % HEIGHT * LINES + place % LINES;
 }
 
-// Of one pair of a layer's light, along x, what is at `item` of the columns of a workgroup; nothing of pairs that
-// follow the last one.
+// Of one pair of a layer's light, along x, what is at `item` of the columns of workgroup `columns`; nothing of pairs
+// that follow the last one.
 fn light_spectrum(layer_pair: u32, columns: u32, item: u32) -> Stored {
     let place = item * THREADS + thread;
     let x = columns * LINES + place % LINES;
@@ -206,12 +208,12 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
     }
 }
 
-// Of one pair of what is seen at a focus, along x, what is at `item` of the rows of a workgroup; nothing of pairs that
-// follow the last one.
-fn seen_spectrum(focus_pair: u32, rows: u32, item: u32) -> Stored {
+// Of one pair of what is seen at a focus, along x, what is at `item` of the rows of workgroup `rows`; nothing of pairs
+// from `end` on.
+fn seen_spectrum(focus_pair: u32, end: u32, rows: u32, item: u32) -> Stored {
     let place = item * THREADS + thread;
     let y = rows * LINES + place % LINES;
-    if (place < PLACES && y < HEIGHT && focus_pair < LAYERS * PAIRS) {
+    if (place < PLACES && y < HEIGHT && focus_pair < end) {
         return spectra[((FIRST_SEEN + focus_pair) * HEIGHT + y) * WIDTH + place / LINES];
     }
     return Stored();
@@ -222,12 +224,13 @@ fn seen_spectrum(focus_pair: u32, rows: u32, item: u32) -> Stored {
 fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
     let first_focus = LAYERS_TOGETHER * group.y;
+    let end = (first_focus + LAYERS_TOGETHER) * PAIRS;
     // What the map's present group has.
     var shown: array<vec4f, ITEMS>;
     // Each pair's spectra are asked for while those before are transformed.
     var next: array<Stored, ITEMS>;
     for (var item = 0u; item < ITEMS; item++) {
-        next[item] = seen_spectrum(first_focus * PAIRS, group.x, item);
+        next[item] = seen_spectrum(first_focus * PAIRS, end, group.x, item);
     }
     for (var slot = 0u; slot < LAYERS_TOGETHER; slot++) {
         let focus = first_focus + slot;
@@ -239,7 +242,7 @@ fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) ind
                     // What the pair before has left, the second time round.
                     white_red[item] = line[place];
                     line[place] = loaded(next[item]);
-                    next[item] = seen_spectrum(focus * PAIRS + pair + 1u, group.x, item);
+                    next[item] = seen_spectrum(focus * PAIRS + pair + 1u, end, group.x, item);
                 }
             }
             transform(INVERSE);

@@ -170,7 +170,7 @@ pub(super) fn transfer_tables(bench: &DisplayGeometry, size: Resolution, u: Metr
     let of_colour = |colour| {
         let transposed = transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, u);
         let bins = (0..=size.height / 2).flat_map(|y| (0..=size.width / 2).map(move |x| (x, y)));
-        bins.map(move |(x, y)| (x % size.width) * size.height + y % size.height)
+        bins.map(move |(x, y)| x * size.height + y)
             .map(move |place| [transposed[place].re * scale, transposed[place].im * scale])
     };
     Colour::ALL.into_iter().flat_map(of_colour).collect()

@@ -72,7 +72,7 @@ fn measure_tiles(@builtin(workgroup_id) tile: vec3u, @builtin(local_invocation_i
     }
 }
 
-// What a workgroup of `phases` does: blocks across and down, less one at each edge, whose errors others need.
+// What a workgroup of `phases` does: blocks across and down, less one at each edge, of which it needs the errors only.
 const THREADS: u32 = BLOCKS_ACROSS * BLOCKS_DOWN;
 const ACROSS: u32 = (BLOCKS_ACROSS - 2) * BLOCK;
 const DOWN: u32 = (BLOCKS_DOWN - 2) * BLOCK;

@@ -20,8 +20,8 @@ const COMPARE_RADIX: usize = 15;
 /// Samples of a row that a thread holds of all colours of two fields.
 const CHANGE_ITEMS: usize = 6;
 
-/// Adds the stage `feedback`: changes the carried field by what it lacks of the amplitudes that an eye should see, and
-/// writes the field, its change and the lack to `inputs`.
+/// Adds the stage `feedback`: writes to `inputs` the carried field with a share of its change by what it lacks of the
+/// amplitudes that an eye should see, that change, and the lack.
 #[expect(clippy::too_many_arguments)]
 pub(super) fn feed_back(
     plan: &mut Plan,

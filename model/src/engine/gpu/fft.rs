@@ -86,7 +86,7 @@ impl LineFft {
         Ok(Self { length, span, radices, turns, stored, limits })
     }
 
-    /// The same with radices up to `most`, and what passes have to do, for threads that need registers for more.
+    /// The same with radices up to `most`, primes excepted, for threads whose registers hold other things too.
     pub(crate) fn with_radices_up_to(&self, most: usize) -> Self {
         Self { radices: radices(self.span, most), ..self.clone() }
     }

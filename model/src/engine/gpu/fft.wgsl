@@ -2,11 +2,10 @@
 // by Stockham's passes where LENGTH has no prime factor above 13, and else by Bluestein's chirps, over SPAN samples.
 //
 // A thread stores to and loads from `line` only the places item·THREADS + thread, below PLACES, item in 0..ITEMS; place
-// p is sample p / LINES of line p % LINES. Nothing else has to be waited for around `transform`. Lines beyond the last
-// one may hold anything.
+// p is sample p / LINES of line p % LINES. Nothing else has to be waited for around `transform`; who touches places of
+// other threads has barriers of its own. Lines beyond the last one may hold anything.
 //
-// UNITARY times a transform keeps the sum of squares: what buffers hold between passes is made of such transforms, so
-// that its numbers are about as large as the field's.
+// UNITARY times a transform keeps the sum of squares: what buffers hold between passes is made of such transforms.
 //
 // Before this file: LENGTH, SPAN, LINES, THREADS, BLUESTEIN, UNITARY, and how buffers hold complex numbers. After it:
 // the other butterflies, a pass for each radix, and `passes`, as fft.rs writes them.

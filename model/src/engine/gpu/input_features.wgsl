@@ -1,5 +1,5 @@
-// What the nets of `expected-stack` are told of a frame, as input_features.rs writes it. Before this file: WIDTH,
-// HEIGHT, blocks.wgsl and what the nets' map declares as `input`.
+// What the nets of `expected-stack` are told of a frame, as input_features.rs writes it. Before this file:
+// FRAME_WIDTH, FRAME_HEIGHT and blocks.wgsl; after it: `frame`.
 
 // The eye's pupil in millimetres, and what networks are told of it and the bench (conditions.rs).
 struct Pupil {

@@ -1,4 +1,5 @@
-// The field on the network's grid as the `direct` family has it. Before this file: WIDTH and HEIGHT.
+// The field on the network's grid as the `direct` family has it. Before this file: WIDTH, HEIGHT,
+// and how buffers hold complex numbers.
 
 @group(0) @binding(1) var<storage, read> field_low: array<Stored>; // [3, height, width]
 

@@ -33,6 +33,12 @@ impl Format {
         }
     }
 
+    /// Of what a net with features in this format gives: sums of matrices that are no features leave it in single
+    /// precision.
+    pub(crate) fn of_outputs(self) -> Self {
+        if let Self::HalfTiles(_) = self { Self::Single } else { self }
+    }
+
     pub(crate) fn precision(self) -> Precision {
         match self {
             Self::Single => Precision::Single,

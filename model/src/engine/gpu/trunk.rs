@@ -66,9 +66,7 @@ pub(super) fn run(
     let last = layers.len() - 1;
     let features = Map::with(format, plan, "features", size, layers[0].out_channels);
     let between = Map::with(format, plan, "features between two layers", size, layers[0].out_channels);
-    // Matrices are stored to tiles in half precision or to groups in single.
-    let given = if let Format::HalfTiles(_) = format { Format::Single } else { format };
-    let output = Map::with(given, plan, "what a net gives", size, layers[last].out_channels);
+    let output = Map::with(format.of_outputs(), plan, "what a net gives", size, layers[last].out_channels);
     let in_order: Vec<usize> = (0..layers[0].out_channels).collect();
     let mut modulated = Vec::new();
     for (index, layer) in layers.iter().enumerate() {

@@ -35,8 +35,8 @@ fn correct(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
         for (var item = 0u; item < ITEMS; item++) {
             let place = item * THREADS + thread;
             if (place < PLACES) {
-                let of_two = select(fields[item][0], fields[item][1], colour == 1u);
-                line[place] = UNITARY * select(of_two, fields[item][2], colour == 2u);
+                let red_or_green = select(fields[item][0], fields[item][1], colour == 1u);
+                line[place] = UNITARY * select(red_or_green, fields[item][2], colour == 2u);
             }
         }
         transform(FORWARD);
