@@ -17,6 +17,8 @@ pub(super) const TAPS: usize = 9;
 const WORKGROUP: usize = 64;
 /// Bytes of parameters that the shaders load at once.
 const ELEMENT_BYTES: usize = 64;
+/// A thread's rows are those that Winograd's points give.
+const _: () = assert!(ROWS + 2 == winograd::POINTS);
 /// Groups of input channels whose products are summed in half precision, at most.
 const MOST_TRIP_GROUPS: usize = 4;
 
