@@ -16,7 +16,9 @@ fn load_weights(place: u32) -> Weights {
 fn multiply_add(pixels: Pixels, weights: Weights, sums: Sums) -> Sums {
     var low = sums[0];
     var high = sums[1];
-    for (var channel = 0u; channel < 16u; channel++) {
+    // Always 16: a loop that drivers see the end of they would write out, and compile for seconds.
+    let channels = 16u + lane / 32u;
+    for (var channel = 0u; channel < channels; channel++) {
         let value = vec4f(vec4<f16>(MEMORY[pixels + channel / 4u][channel % 4u]));
         low = fma(value, vec4f(parameters[weights + 4u * channel]), low);
         high = fma(value, vec4f(parameters[weights + 4u * channel + 1u]), high);
