@@ -364,13 +364,14 @@ mod tests {
 
     const LIMITS: WorkgroupLimits = WorkgroupLimits { bytes: 32 << 10, threads: 1024 };
 
-    /// Transforms rows from binding 1 to binding 2.
+    /// Transforms rows from binding 1 to binding 2, workgroups of y 0 forwards, and those of y 1 back.
     const ROWS: &str = "
         @group(0) @binding(1) var<storage, read> before: array<vec2f>;
         @group(0) @binding(2) var<storage, read_write> after: array<vec2f>;
         @compute @workgroup_size(THREADS)
         fn rows(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
             thread = index;
+            let back = group.y == 1u;
             for (var item = 0u; item < ITEMS; item++) {
                 let place = item * THREADS + thread;
                 let y = group.x * LINES + place % LINES;
@@ -378,12 +379,12 @@ mod tests {
                     line[place] = before[y * LENGTH + place / LINES];
                 }
             }
-            transform(DIRECTION);
+            transform(select(FORWARD, INVERSE, back));
             for (var item = 0u; item < ITEMS; item++) {
                 let place = item * THREADS + thread;
                 let y = group.x * LINES + place % LINES;
                 if (place < PLACES && y < HEIGHT) {
-                    after[y * LENGTH + place / LINES] = line[place];
+                    after[(group.y * HEIGHT + y) * LENGTH + place / LINES] = line[place];
                 }
             }
         }";
@@ -392,28 +393,26 @@ mod tests {
         (0..count).map(|i| Complex64::cis((i as f64 + 0.3).powf(1.7)) * (1.0 + (i % 5) as f64)).collect()
     }
 
-    /// Transforms noise of `height` rows on the device; returns that and the exact transform.
-    fn transformed(
-        (length, height): (usize, usize),
-        lines: impl Fn(&LineFft) -> Lines,
-        direction: f32,
-    ) -> [Vec<Complex64>; 2] {
+    /// Transforms noise of `height` rows on the device, forwards and back; returns each with the exact transform.
+    fn transformed((length, height): (usize, usize), lines: impl Fn(&LineFft) -> Lines) -> [[Vec<Complex64>; 2]; 2] {
         let mut plan = Plan::default();
         let lines = lines(&LineFft::new(&mut plan, length, Precision::Single, LIMITS).expect("it fits"));
-        let (from, to) =
-            (plan.buffer::<[f32; 2]>("from", length * height), plan.buffer::<[f32; 2]>("to", length * height));
-        let constants = [("HEIGHT", height.into()), ("DIRECTION", direction.into())];
-        let shader = lines.shader("rows", &constants, &[ROWS], "rows");
-        let workgroups = [lines.workgroups(height), 1, 1];
+        let count = length * height;
+        let (from, to) = (plan.buffer::<[f32; 2]>("from", count), plan.buffer::<[f32; 2]>("to", 2 * count));
+        let shader = lines.shader("rows", &[("HEIGHT", height.into())], &[ROWS], "rows");
+        let workgroups = [lines.workgroups(height), 2, 1];
         plan.stage("rows", 0).dispatch_with(shader, &[lines.turns(), (1, from), (2, to)], workgroups);
         let trial = Trial::new(&plan);
-        let mut values = noise(length * height);
+        let values = noise(count);
         trial.write(from, &values.iter().flat_map(|value| [value.re as f32, value.im as f32]).collect::<Vec<_>>());
         trial.run();
         let found = complex(Precision::Single, &trial.read(to));
-        let direction = if direction > 0.0 { FftDirection::Forward } else { FftDirection::Inverse };
-        f64::plan(length, direction).process(&mut values);
-        [found, values]
+        let (forward, inverse) = found.split_at(count);
+        [(forward, FftDirection::Forward), (inverse, FftDirection::Inverse)].map(|(found, direction)| {
+            let mut expected = values.clone();
+            f64::plan(length, direction).process(&mut expected);
+            [found.to_vec(), expected]
+        })
     }
 
     fn error([found, expected]: &[Vec<Complex64>; 2]) -> f64 {
@@ -429,15 +428,14 @@ mod tests {
         .into_iter()
         .chain([1021, 1232, 2080, 3840]);
         for (index, length) in lengths.enumerate() {
-            for direction in [1.0, -1.0] {
-                let lines = |fft: &LineFft| match index % 3 {
-                    0 => fft.rows(4),
-                    1 => fft.with_radices_up_to(12).mirrored_columns(2),
-                    _ => fft.columns(9),
-                };
-                let mut both = transformed((length, 11), lines, direction);
+            let lines = |fft: &LineFft| match index % 3 {
+                0 => fft.rows(4),
+                1 => fft.with_radices_up_to(12).mirrored_columns(2),
+                _ => fft.columns(9),
+            };
+            for (mut both, direction) in transformed((length, 11), lines).into_iter().zip(["forwards", "back"]) {
                 let found = error(&both);
-                assert!(found < 1e-6, "{length}, direction {direction}: {found}");
+                assert!(found < 1e-6, "{length}, {direction}: {found}");
                 let largest = both[1].iter().map(|value| value.norm()).fold(0.0, f64::max);
                 both[1][length * 5].im += 3e-6 * largest;
                 assert!(error(&both) > 1e-6, "the comparison is blind");
