@@ -505,19 +505,20 @@ fn filtered(
         if 2.0 * bin < bins as f64 { bin / bins as f64 } else { bin / bins as f64 - 1.0 }
     };
     let transform = |values: &[Complex64], sign: f64| -> Vec<Complex64> {
-        let turn = |bin: usize, sample: usize, bins: usize| {
-            Complex64::cis(sign * TAU * (bin * sample % bins) as f64 / bins as f64)
+        let turns = |bins: usize| -> Vec<Complex64> {
+            (0..bins).map(|turn| Complex64::cis(sign * TAU * turn as f64 / bins as f64)).collect()
         };
+        let (turns_x, turns_y) = (turns(columns), turns(rows));
         let along_rows: Vec<_> = (0..rows * columns)
             .map(|i| {
-                let row = &values[i / columns * columns..][..columns];
-                row.iter().enumerate().map(|(x, value)| value * turn(i % columns, x, columns)).sum::<Complex64>()
+                let row = values[i / columns * columns..][..columns].iter().enumerate();
+                row.map(|(x, value)| value * turns_x[(i % columns) * x % columns]).sum::<Complex64>()
             })
             .collect();
         (0..rows * columns)
             .map(|i| {
                 let column = along_rows[i % columns..].iter().step_by(columns).enumerate();
-                let sum: Complex64 = column.map(|(y, value)| value * turn(i / columns, y, rows)).sum();
+                let sum: Complex64 = column.map(|(y, value)| value * turns_y[(i / columns) * y % rows]).sum();
                 sum / ((rows * columns) as f64).sqrt()
             })
             .collect()
@@ -531,19 +532,21 @@ fn filtered(
 
 /// The field [3, rows, columns] of the network's grid at the panel's resolution.
 fn onto_panel(grid: Grid, resolution: Resolution, low: &[Complex64], [rows, columns]: [usize; 2]) -> Vec<Complex64> {
+    if grid == Grid::Full {
+        return low.to_vec();
+    }
+    let interpolators =
+        |samples: usize, pixels: usize| (0..pixels).map(move |pixel| interpolator(samples, pixel)).collect::<Vec<_>>();
+    let (along_x, along_y) = (interpolators(columns, resolution.width), interpolators(rows, resolution.height));
+    let weighted = |values: &[Complex64], weights: &[f64]| -> Complex64 {
+        values.iter().zip(weights).map(|(value, weight)| value * weight).sum()
+    };
     let mut field = Vec::new();
     for predicted in low.chunks_exact(rows * columns) {
-        for (y, x) in (0..resolution.height).flat_map(|y| (0..resolution.width).map(move |x| (y, x))) {
-            field.push(match grid {
-                Grid::Full => predicted[y * columns + x],
-                Grid::HalfBand => {
-                    let (along_y, along_x) = (interpolator(rows, y), interpolator(columns, x));
-                    let row =
-                        |j: usize| (0..columns).map(|i| predicted[j * columns + i] * along_x[i]).sum::<Complex64>();
-                    (0..rows).map(|j| row(j) * along_y[j]).sum()
-                }
-            });
-        }
+        // Of each of the panel's columns, what it has at the rows of the network's grid.
+        let column = |weights: &Vec<f64>| predicted.chunks_exact(columns).map(|row| weighted(row, weights)).collect();
+        let tall: Vec<Vec<Complex64>> = along_x.iter().map(column).collect();
+        field.extend(along_y.iter().flat_map(|weights| tall.iter().map(|column| weighted(column, weights))));
     }
     field
 }
