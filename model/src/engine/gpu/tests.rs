@@ -297,10 +297,11 @@ fn check_engine(
     assert!(levels_apart(&samples, &expected) > tolerated, "{context}: the comparison of levels is blind");
 }
 
+/// One at the size of its golden vectors, whose test compiles the same shaders.
 #[test]
 fn the_built_in_networks_match_the_reference_at_both_ends_of_the_pupil_range() {
-    for (weights, width, height) in [(Weights::builtin(), 37, 61), (Weights::builtin_small(), 64, 48)] {
-        let resolution = Resolution { width, height };
+    let golden = Resolution { width: 48, height: 32 };
+    for (weights, resolution) in [(Weights::builtin(), golden), (Weights::builtin_small(), SIZE)] {
         let mut engine = engine(&weights, &DisplayGeometry::DEFAULT, resolution);
         for pupil_mm in [1.0, 5.0] {
             check_engine(&mut engine, &DisplayGeometry::DEFAULT, &weights, resolution, pupil_mm, 3);
@@ -321,21 +322,26 @@ fn a_network_of_direct_products_matches_the_reference_at_both_ends_of_the_pupil_
     }
 }
 
-/// Of tests that can have any size: the software device compiles every shader for each one.
-const SIZE: Resolution = Resolution { width: 37, height: 22 };
+/// Of tests that can have any size: the software device compiles every shader for each one, and takes what another test
+/// has compiled. Lines of half of it have small factors, whose transforms are compiled soonest; of lines of 9 samples a
+/// frequency lies on the edge of a pupil of 1 mm in blue light, and rounding decides.
+const SIZE: Resolution = Resolution { width: 39, height: 19 };
 
 #[test]
 fn networks_on_another_bench_match_the_reference() {
     let direct = random_weights(NetworkConfig { channels: 12, ..weights_tests::config() }, 5);
-    for (weights, pupil_mm) in [(direct, 2.0), (Weights::builtin_small(), 1.0), (Weights::builtin_small(), 9.0)] {
-        check_on(&OTHER_BENCH, &weights, SIZE, pupil_mm, 6);
+    for (weights, pupils_mm) in [(direct, &[2.0][..]), (Weights::builtin_small(), &[1.0, 9.0])] {
+        let mut engine = engine(&weights, &OTHER_BENCH, SIZE);
+        for &pupil_mm in pupils_mm {
+            check_engine(&mut engine, &OTHER_BENCH, &weights, SIZE, pupil_mm, 6);
+        }
     }
 }
 
-/// The reference would take a minute.
+/// Of more than one workgroup each way, and a part of one. The reference would take a minute.
 #[test]
-fn a_frame_of_256_pixels_each_way_is_the_processors() {
-    let (weights, resolution) = (Weights::builtin(), Resolution { width: 256, height: 256 });
+fn a_frame_of_many_workgroups_is_the_processors() {
+    let (weights, resolution) = (Weights::builtin(), Resolution { width: 144, height: 256 });
     let frame = frame(resolution, 5);
     let mut on_cpu = ComplexHologram::dark(resolution);
     CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, resolution, Precision::Single)
@@ -367,15 +373,17 @@ fn whole_networks_in_half_precision_are_near_the_same_in_single() {
     }
 }
 
-/// Asserts that what an engine in half precision gives is near the same in single precision, and is not that.
+/// Asserts that what an engine in half precision gives is near what the processor gives in single precision, and is not
+/// that.
 fn assert_near_single(half: &mut GpuEngine, weights: &Weights, bench: &DisplayGeometry, frame: &Arc<RgbdFrame>) {
-    let mut single = engine(weights, bench, frame.resolution);
+    let mut on_cpu = CpuEngine::new(weights, bench, frame.resolution, Precision::Single).expect("an engine");
+    let mut single = ComplexHologram::dark(frame.resolution);
     for pupil_mm in [1.0, 6.0] {
-        let (_, single) = rendered(&mut single, frame, pupil_mm);
+        on_cpu.render(frame, PupilDiameter::from_mm(pupil_mm), &mut single).expect("a frame");
         let (_, mut found) = rendered(half, frame, pupil_mm);
         let expected: Vec<_> = single.field.iter().map(|v| Complex64::new(v.re.into(), v.im.into())).collect();
         let error = field_error(&found.field, &expected);
-        assert!(error > 1e-5, "{error}: it was computed in single precision");
+        assert!(error > FIELD_TOLERANCE, "{error}: it was computed in single precision");
         assert!(error < HALF_FIELD_TOLERANCE, "{error} at {pupil_mm} mm");
         let largest = expected.iter().map(|value| value.norm()).fold(0.0, f64::max);
         found.field[99].re += (3.0 * HALF_FIELD_TOLERANCE * largest) as f32;
@@ -440,7 +448,7 @@ fn sizes_that_are_tiny_narrow_or_prime_match_the_reference() {
     let refined = random_weights(refined, 5);
     let direct = random_weights(NetworkConfig { channels: 12, ..weights_tests::config() }, 5);
     for (weights, width, height) in
-        [(&expected_stack, 1, 1), (&direct, 1, 1), (&refined, 1, 33), (&direct, 101, 5), (&expected_stack, 74, 22)]
+        [(&expected_stack, 1, 1), (&direct, 1, 1), (&refined, 1, 33), (&direct, 37, 5), (&expected_stack, 34, 38)]
     {
         check(weights, Resolution { width, height }, 3.3, 9);
     }
