@@ -338,10 +338,10 @@ fn networks_on_another_bench_match_the_reference() {
     }
 }
 
-/// Of more than one workgroup each way, and a part of one. The reference would take a minute.
+/// The reference would take a minute.
 #[test]
-fn a_frame_of_many_workgroups_is_the_processors() {
-    let (weights, resolution) = (Weights::builtin(), Resolution { width: 144, height: 256 });
+fn a_frame_of_256_pixels_each_way_is_the_processors() {
+    let (weights, resolution) = (Weights::builtin(), Resolution { width: 256, height: 256 });
     let frame = frame(resolution, 5);
     let mut on_cpu = ComplexHologram::dark(resolution);
     CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, resolution, Precision::Single)
