@@ -7,7 +7,9 @@ use std::process::ExitCode;
 use clap::{Parser, ValueEnum};
 use holod_calibration::Resolution;
 use holod_model::Weights;
-use holod_model::engine::gpu_cost::{CARDS, Card, Compiler, CostError, CountedBy, FrameCost, FramePlan, SERVE, serve};
+use holod_model::engine::gpu_cost::{
+    CARDS, Card, Compiler, CostError, CountedBy, FrameCost, FramePlan, Products, SERVE, serve,
+};
 use serde::Serialize;
 
 /// What one frame of the built-in networks costs on graphics cards that are not there, by a model.
@@ -36,6 +38,10 @@ struct Cli {
     /// With features in half precision: two products at once.
     #[arg(long)]
     half_precision: bool,
+    /// With features in half precision whose layers multiply matrices, on units of their own. Needs Mesa 25.0 and a
+    /// card of RDNA 3: without --card, the RX 7900 XTX.
+    #[arg(long, conflicts_with = "half_precision")]
+    matrix_units: bool,
     /// Print the costs of each dispatch as JSON.
     #[arg(long)]
     json: bool,
@@ -153,11 +159,17 @@ fn run(cli: &Cli, say: impl Fn(&str)) -> Result<(), Failure> {
         .map_err(|error| Failure { code: exit::UNAVAILABLE, message: format!("this program's own file: {error}") })?;
     let networks = [Network::Standard, Network::Small, Network::Fast].into_iter();
     let networks: Vec<_> = networks.filter(|network| cli.network.is_none_or(|wanted| wanted == *network)).collect();
+    let products = match (cli.matrix_units, cli.half_precision) {
+        (true, _) => Products::Matrices,
+        (_, true) => Products::Half,
+        _ => Products::Single,
+    };
+    let card = cli.card.or(cli.matrix_units.then_some(CardName::Rx7900Xtx));
     let names = [CardName::Rx7900Xtx, CardName::Rx6800Xt];
     let cards: Vec<Card> = names
         .into_iter()
         .zip(CARDS)
-        .filter(|(name, _)| cli.card.is_none_or(|card| card == *name))
+        .filter(|(name, _)| card.is_none_or(|card| card == *name))
         .map(|(_, c)| c)
         .collect();
     let resolutions = cli.resolution.map_or(RESOLUTIONS.to_vec(), |resolution| vec![resolution]);
@@ -165,10 +177,11 @@ fn run(cli: &Cli, say: impl Fn(&str)) -> Result<(), Failure> {
     let mut reports = Vec::new();
     for card in cards {
         let mut compiler = Compiler::new(&program, card)?;
+        compiler.check(products)?;
         for network in &networks {
             let weights = network.weights();
             for &resolution in &resolutions {
-                let plan = FramePlan::new(&weights, resolution, cli.half_precision)
+                let plan = FramePlan::new(&weights, resolution, products)
                     .map_err(|error| Failure { code: exit::USAGE, message: error.to_string() })?;
                 if let Some(label) = &cli.assembly {
                     let texts = compiler.assembly(&plan, label)?;

@@ -95,15 +95,16 @@ impl Gpu {
         let wgpu::AdapterInfo { name, vendor, .. } = adapter.get_info();
         let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let half_precision = adapter.features() & wgpu::Features::SHADER_F16;
-        let (matrix_units, experimental_features) = match with_matrices && has_matrix_units(adapter) {
+        let matrix_units = with_matrices.then(|| matrix_units(adapter)).flatten();
+        let (matrices, experimental_features) = match matrix_units {
             // SAFETY: no other experimental feature is asked for, and this one is used by this crate's own shaders
-            // alone, whose results are compared with the reference's on cards that have it.
-            true => (wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX, unsafe { wgpu::ExperimentalFeatures::enabled() }),
-            false => (wgpu::Features::empty(), wgpu::ExperimentalFeatures::disabled()),
+            // alone, whose results are compared with the reference's on cards that have it: NVIDIA's, so far.
+            Some(units) => (matrix_features(units), unsafe { wgpu::ExperimentalFeatures::enabled() }),
+            None => (wgpu::Features::empty(), wgpu::ExperimentalFeatures::disabled()),
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("holod"),
-            required_features: timestamps | half_precision | matrix_units,
+            required_features: timestamps | half_precision | matrices,
             required_limits: adapter.limits(),
             experimental_features,
             memory_hints: wgpu::MemoryHints::Performance,
@@ -126,7 +127,6 @@ impl Gpu {
         let workgroup_bytes = limits.max_compute_workgroup_storage_size;
         let workgroup_threads = limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x);
         let half_precision = !half_precision.is_empty();
-        let matrix_units = (!matrix_units.is_empty()).then_some(MatrixUnits::Device);
         let timestamp_ns = (!timestamps.is_empty()).then(|| queue.get_timestamp_period());
         Ok(Self {
             device,
@@ -336,19 +336,37 @@ impl<T> Drop for GivenBack<T> {
     }
 }
 
-/// Whether the adapter multiplies matrices as [`MatrixUnits`] does, in subgroups of 32 threads always: where their size
-/// may vary, a workgroup of 32 could be half of one.
-fn has_matrix_units(adapter: &wgpu::Adapter) -> bool {
+/// How the adapter multiplies matrices, if it does so as [`MatrixUnits`] does.
+fn matrix_units(adapter: &wgpu::Adapter) -> Option<MatrixUnits> {
     use wgpu::CooperativeScalarType::{F16, F32};
     let info = adapter.get_info();
-    let features = wgpu::Features::SHADER_F16 | wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX;
+    let units = units_of_subgroups(info.subgroup_min_size, info.subgroup_max_size)?;
+    let features = wgpu::Features::SHADER_F16 | matrix_features(units);
     let of_16 = |offered: &wgpu::CooperativeMatrixProperties| {
         let &wgpu::CooperativeMatrixProperties { m_size, n_size, k_size, ab_type, cr_type, .. } = offered;
         (m_size, n_size, k_size, ab_type, cr_type) == (16, 16, 16, F16, F32)
     };
-    adapter.features().contains(features)
-        && (info.subgroup_min_size, info.subgroup_max_size) == (32, 32)
-        && adapter.cooperative_matrix_properties().iter().any(of_16)
+    let has_them = adapter.features().contains(features) && adapter.cooperative_matrix_properties().iter().any(of_16);
+    has_them.then_some(units)
+}
+
+/// Those of a device whose subgroups have from `least` to `most` threads; where that may vary, a workgroup of 32 could be
+/// half of one.
+fn units_of_subgroups(least: u32, most: u32) -> Option<MatrixUnits> {
+    match (least, most) {
+        (32, 32) => Some(MatrixUnits::Device),
+        (32, 64) | (64, 64) => Some(MatrixUnits::DeviceOfAnySubgroups),
+        _ => None,
+    }
+}
+
+/// What shaders for these units need of a device besides half precision.
+fn matrix_features(units: MatrixUnits) -> wgpu::Features {
+    let matrices = wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX;
+    match units {
+        MatrixUnits::DeviceOfAnySubgroups => matrices | wgpu::Features::SUBGROUP,
+        _ => matrices,
+    }
 }
 
 /// Whether work has ended within the time that it was waited for.
@@ -393,6 +411,15 @@ pub(crate) mod tests {
         let refused = Gpu::candidates(choice("no such card")).expect_err("no such card");
         let text = refused.to_string();
         assert!(["no such card", "model.gpu", test_gpu.name()].iter().all(|part| text.contains(part)), "{text}");
+    }
+
+    #[test]
+    fn units_are_used_by_the_sizes_that_subgroups_may_have() {
+        assert_eq!(units_of_subgroups(32, 32), Some(MatrixUnits::Device));
+        assert_eq!(units_of_subgroups(32, 64), Some(MatrixUnits::DeviceOfAnySubgroups));
+        assert_eq!(units_of_subgroups(64, 64), Some(MatrixUnits::DeviceOfAnySubgroups));
+        assert_eq!([(8, 32), (16, 16), (4, 128)].map(|(least, most)| units_of_subgroups(least, most)), [None; 3]);
+        assert!(matrix_features(MatrixUnits::DeviceOfAnySubgroups).contains(wgpu::Features::SUBGROUP));
     }
 
     #[test]

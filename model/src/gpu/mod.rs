@@ -44,9 +44,14 @@ impl From<Adapters> for GpuChoice<'_> {
 pub(crate) enum MatrixUnits {
     /// The device's own, which a subgroup of 32 threads drives (Vulkan's cooperative matrices).
     Device,
+    /// The same in subgroups of 32 or 64 threads, as the driver chooses.
+    DeviceOfAnySubgroups,
     /// A workgroup of 32 threads that multiplies as they do: for tests, since software devices have none.
     #[cfg(test)]
     Threads,
+    /// A workgroup of 64 threads that does so, as one subgroup or as two.
+    #[cfg(test)]
+    ThreadsOfAnySubgroups { in_one: bool },
 }
 
 /// The name of the device among `adapters` that an engine would take.

@@ -11,6 +11,7 @@ use super::matrix::{self, TilePacking};
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan, Shader};
 use super::winograd;
 use crate::engine::Precision;
+use crate::gpu::MatrixUnits;
 
 pub(super) const TAPS: usize = 9;
 /// Threads of a workgroup, along x.
@@ -20,7 +21,7 @@ const ELEMENT_BYTES: usize = 64;
 /// A thread's rows are those that Winograd's points give.
 const _: () = assert!(ROWS + 2 == winograd::POINTS);
 /// Groups of input channels whose products are summed in half precision, at most.
-const MOST_TRIP_GROUPS: usize = 4;
+const MOST_TRIP_GROUPS: usize = 5;
 
 /// How a layer that multiplies vectors makes its products.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -158,8 +159,8 @@ enum Layout {
     /// Threads make the output channels in parts of a few whole groups; those beyond the map's groups are zero and not
     /// stored.
     Groups { method: Method, input_groups: usize, parts: usize, part_groups: usize },
-    /// Matrices, for each column of the kernel, block of inputs and row of the kernel.
-    Tiles { input_blocks: usize, packing: TilePacking },
+    /// Matrices, for each column of the kernel, block of inputs and row of the kernel or point.
+    Tiles { input_blocks: usize, column_weights: usize, packing: TilePacking },
 }
 
 impl Packing {
@@ -172,9 +173,11 @@ impl Packing {
     }
 
     /// For a layer that multiplies matrices, and reads the first `input_blocks` of a map.
-    fn of_tiles(input_blocks: usize, output_groups: usize) -> Self {
-        let packing = TilePacking::new(output_groups, TAPS * input_blocks);
-        Self { precision: Precision::Half, layout: Layout::Tiles { input_blocks, packing } }
+    fn of_tiles(units: MatrixUnits, input_blocks: usize, output_groups: usize) -> Self {
+        let method = if matrix::by_points(units) { Method::Winograd } else { Method::Direct };
+        let column_weights = method.column_weights();
+        let packing = TilePacking::new(units, output_groups, 3 * column_weights * input_blocks);
+        Self { precision: Precision::Half, layout: Layout::Tiles { input_blocks, column_weights, packing } }
     }
 
     /// Numbers in the buffer.
@@ -216,8 +219,8 @@ impl Packing {
                 let channel = (column * method.column_weights() + row) * GROUP + input % GROUP;
                 first + (channel * part_groups + group) * GROUP + lane
             }
-            Layout::Tiles { input_blocks, packing } => {
-                packing.place(output, (column * input_blocks + input / TILE) * 3 + row, input)
+            Layout::Tiles { input_blocks, column_weights, packing } => {
+                packing.place(output, (column * input_blocks + input / TILE) * column_weights + row, input)
             }
         }
     }
@@ -239,7 +242,8 @@ impl Packing {
                     let weights = [0, 1, 2].map(|row| weight(output, input, row * 3 + column));
                     let mut put = |row, weight| parameters[self.place(output, *channel, column, row)] = weight;
                     match self.layout {
-                        Layout::Groups { method: Method::Winograd, .. } => {
+                        Layout::Groups { method: Method::Winograd, .. }
+                        | Layout::Tiles { column_weights: winograd::POINTS, .. } => {
                             winograd::at_points(weights).into_iter().enumerate().for_each(|(point, at)| put(point, at));
                         }
                         _ => weights.into_iter().enumerate().for_each(|(row, weight)| put(row, weight)),
@@ -280,7 +284,7 @@ pub(crate) fn convolve(
     let method = if precision == Precision::Half { Method::Winograd } else { method };
     let input_blocks = input_groups.div_ceil(TILE / GROUP);
     let packing = match input.format {
-        Format::HalfTiles(_) => Packing::of_tiles(input_blocks, output.groups),
+        Format::HalfTiles(units) => Packing::of_tiles(units, input_blocks, output.groups),
         Format::Single | Format::Half => Packing::new(method, precision, input_groups, output.groups),
     };
     let parameters = packing.precision.table(plan, "a convolution's parameters", &packing.pack(layer));
@@ -291,7 +295,14 @@ pub(crate) fn convolve(
         (Format::HalfTiles(units), _) => {
             let rows = matrix::rows(units);
             constants.extend([("INPUT_BLOCKS", input_blocks.into()), input.block("IN_BLOCK")]);
-            (matrix::source(output, units, "input", rows, &[include_str!("conv_matrix.wgsl")]), rows, TILE)
+            let source = if matrix::by_points(units) {
+                constants.extend(winograd::constants());
+                let text = winograd::source("f16", include_str!("conv_matrix_winograd.wgsl"));
+                matrix::source(output, units, "points", rows, &[&text])
+            } else {
+                matrix::source(output, units, "input", rows, &[include_str!("conv_matrix.wgsl")])
+            };
+            (source, rows, TILE)
         }
         (_, Layout::Groups { part_groups, .. }) => {
             constants.extend([
@@ -304,11 +315,13 @@ pub(crate) fn convolve(
             }
             let text = match (method, precision) {
                 (Method::Direct, _) => include_str!("conv.wgsl").to_owned(),
-                (Method::Winograd, Precision::Single) => winograd::source("f32", include_str!("conv_winograd.wgsl")),
+                (Method::Winograd, Precision::Single) => {
+                    winograd::source_with_rows("f32", include_str!("conv_winograd.wgsl"))
+                }
                 (Method::Winograd, Precision::Half) => {
                     let fits = (1..=MOST_TRIP_GROUPS).rev().find(|groups| input_groups.is_multiple_of(*groups));
                     constants.push(("TRIP", fits.expect("each number is a multiple of one").into()));
-                    winograd::source("f16", include_str!("conv_winograd_f16.wgsl"))
+                    winograd::source_with_rows("f16", include_str!("conv_winograd_f16.wgsl"))
                 }
             };
             (layer.source(input, output, &text), ROWS, WORKGROUP)
@@ -333,7 +346,7 @@ pub(super) mod tests {
     use super::super::trial::Trial;
     use super::*;
     use crate::engine::reference;
-    use crate::gpu::{MatrixUnits, test_gpu};
+    use crate::gpu::test_gpu;
 
     /// Largest error allowed, over the output's root mean square: of sums in single precision, and of products and sums
     /// in half precision.
@@ -398,6 +411,12 @@ pub(super) mod tests {
     pub(in super::super) fn tiles() -> Format {
         static UNITS: OnceLock<MatrixUnits> = OnceLock::new();
         Format::HalfTiles(*UNITS.get_or_init(|| test_gpu().matrix_units.unwrap_or(MatrixUnits::Threads)))
+    }
+
+    /// The same and, for threads alone, those of a device that chooses between sizes of subgroups.
+    pub(in super::super) fn all_tiles() -> [Format; 3] {
+        let of_threads = |in_one| Format::HalfTiles(MatrixUnits::ThreadsOfAnySubgroups { in_one });
+        [tiles(), of_threads(false), of_threads(true)]
     }
 
     /// A layer of `outputs` that reads `inputs`, channels of the first groups of a wider map.
@@ -470,6 +489,9 @@ pub(super) mod tests {
                 (Precision::Half, Format::Single | Format::Half) => {
                     judge_within(WINOGRAD_HALF_TOLERANCE, found, expected)
                 }
+                (Precision::Half, Format::HalfTiles(units)) if matrix::by_points(units) => {
+                    judge_within(WINOGRAD_HALF_TOLERANCE, found, expected)
+                }
                 (precision, _) => judge(precision, found, expected),
             }
         }
@@ -517,13 +539,15 @@ pub(super) mod tests {
         }
     }
 
-    /// Between maps of both precisions, with one to four groups to a trip of the loop, and a last part that the map does
+    /// Between maps of both precisions, with two to five groups to a trip of the loop, and a last part that the map does
     /// not fill.
     #[test]
     fn sums_are_right_in_half_precision() {
         let (single, half) = (Format::Single, Format::Half);
         for formats in [[half, half], [single, half], [half, single]] {
-            for (size, inputs, outputs) in [((65, 5), 5, 7), ((9, 7), 9, 24), ((33, 3), 84, 32), ((17, 5), 32, 18)] {
+            for (size, inputs, outputs) in
+                [((65, 5), 5, 7), ((9, 7), 9, 24), ((33, 3), 84, 32), ((17, 5), 32, 18), ((9, 5), 40, 8)]
+            {
                 Case { formats, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky) }.check();
             }
         }
@@ -533,15 +557,17 @@ pub(super) mod tests {
     /// With blocks that the layer does not fill, parts that it does not, and rows of workgroups that end below the map.
     #[test]
     fn sums_of_products_of_matrices_are_right() {
-        let tiles = tiles();
-        for (output, size, inputs, outputs, epilogue) in [
-            (tiles, (33, 5), 32, 32, Epilogue::Leaky),
-            (tiles, (33, 7), 32, 32, Epilogue::ResidualLeaky),
-            (Format::Single, (17, 1), 24, 18, Epilogue::None),
-            (tiles, (31, 3), 84, 34, Epilogue::Leaky),
-            (Format::Single, (1, 1), 5, 7, Epilogue::ResidualLeaky),
-        ] {
-            Case { formats: [tiles, output], ..Case::new(size, inputs, outputs, epilogue) }.check();
+        for tiles in all_tiles() {
+            for (output, size, inputs, outputs, epilogue) in [
+                (tiles, (33, 5), 32, 32, Epilogue::Leaky),
+                (tiles, (33, 7), 32, 32, Epilogue::ResidualLeaky),
+                (Format::Single, (17, 1), 24, 18, Epilogue::None),
+                (tiles, (31, 3), 84, 34, Epilogue::Leaky),
+                (Format::Half, (18, 4), 17, 10, Epilogue::None),
+                (Format::Single, (1, 1), 5, 7, Epilogue::ResidualLeaky),
+            ] {
+                Case { formats: [tiles, output], ..Case::new(size, inputs, outputs, epilogue) }.check();
+            }
         }
     }
 
@@ -593,6 +619,7 @@ pub(super) mod tests {
             (winograd, Format::Single, 1e-3),
             (winograd, Format::Half, 0.1),
             (winograd, tiles(), 0.1),
+            (winograd, all_tiles()[1], 0.1),
         ] {
             let case = Case { method, formats: [format; 2], ..case.clone() };
             let right = case.found();

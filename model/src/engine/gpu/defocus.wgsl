@@ -179,7 +179,7 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
         workgroupBarrier();
     }
     for (var focus = 0u; focus < FOCI; focus++) {
-        if (first_focus + focus >= LAYERS) {
+        if (LAYERS % FOCI > 0u && first_focus + focus >= LAYERS) {
             break;
         }
         for (var item = 0u; item < BIN_PAIR_ITEMS; item++) {

@@ -36,7 +36,7 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
     let (source, values, precision, parts, columns) = match input.format {
         Format::HalfTiles(units) => {
             let input_blocks = input.groups * GROUP / TILE;
-            let packing = TilePacking::new(output.groups, TAPS * input_blocks);
+            let packing = TilePacking::new(units, output.groups, TAPS * input_blocks);
             constants.push(("INPUT_BLOCKS", input_blocks.into()));
             let files = [places, include_str!("deformable_matrix.wgsl")];
             let source = matrix::source(output, units, "gathered", ROWS, &files);
@@ -106,7 +106,7 @@ fn pack(layer: &ConvLayer, precision: Precision, input_groups: usize, [parts, pa
 #[cfg(test)]
 mod tests {
     use super::super::conv::Epilogue;
-    use super::super::conv::tests::{SLOPE, finish, judge, noise, tiles, value, worse};
+    use super::super::conv::tests::{SLOPE, all_tiles, finish, judge, noise, value, worse};
     use super::super::trial::Trial;
     use super::*;
     use crate::engine::reference;
@@ -235,14 +235,15 @@ mod tests {
     /// With blocks that the layer does not fill, and rows of workgroups that end below the map.
     #[test]
     fn sums_of_products_of_matrices_are_right() {
-        let tiles = tiles();
-        for (output, size, inputs, outputs, offset) in [
-            (tiles, (33, 5), 32, 32, wild as Offset),
-            (tiles, (16, 2), 5, 7, moderate),
-            (Format::Single, (1, 1), 24, 40, moderate),
-        ] {
-            let formats = [tiles, output];
-            Case { formats, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky, offset) }.check();
+        for tiles in all_tiles() {
+            for (output, size, inputs, outputs, offset) in [
+                (tiles, (33, 5), 32, 32, wild as Offset),
+                (tiles, (16, 2), 5, 7, moderate),
+                (Format::Single, (1, 1), 24, 40, moderate),
+            ] {
+                let formats = [tiles, output];
+                Case { formats, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky, offset) }.check();
+            }
         }
     }
 

@@ -32,30 +32,34 @@ fn gather(row: u32, tap: u32, x: u32, y: u32) {
     }
 }
 
-@compute @workgroup_size(32)
-fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) index: u32) {
-    lane = index;
-    let part = workgroup.x % PARTS;
-    let first_y = workgroup.y * ROWS;
-    // What this thread gathers, and finishes of each block: two groups of one column.
-    let x = workgroup.x / PARTS * 16u + lane / 2u;
+@compute @workgroup_size(THREADS)
+fn convolve(at: Invocation) {
+    lane = at.index % 32u;
+    let part = at.workgroup.x % PARTS;
+    let first_y = at.workgroup.y * ROWS;
+    // What this thread gathers, and finishes of each block: two groups of one column, in rows from `first_row` on.
+    let first_row = at.index / 32u;
+    let x = at.workgroup.x / PARTS * 16u + lane / 2u;
     let group = part * 8u + lane % 2u * 2u;
 
     each row, block: var sums_{row}_{block} = Sums();
     for (var tap = 0u; tap < 9u; tap++) {
-        each row: gather({row}u, tap, x, first_y + {row}u);
+        for (var row = first_row; row < ROWS; row += THREADS / 32u) {
+            gather(row, tap, x, first_y + row);
+        }
         workgroupBarrier();
         for (var input_block = 0u; input_block < INPUT_BLOCKS; input_block++) {
             each row: let pixels_{row} = load_pixels(({row}u * INPUT_BLOCKS + input_block) * 64u);
             let weight = PARTS * 8u + ((part * 9u + tap) * INPUT_BLOCKS + input_block) * 128u;
             each block: let weights_{block} = load_weights(weight + {block}u * 64u);
-            each row, block: sums_{row}_{block} = multiply_add(pixels_{row}, weights_{block}, sums_{row}_{block});
+            each row, block: if is_own(at, {row}u) { sums_{row}_{block} = multiply_add(pixels_{row}, weights_{block}, sums_{row}_{block}); }
         }
         workgroupBarrier();
     }
 
-    each row, block: store_sums(sums_{row}_{block}, ({row}u * 2u + {block}u) * 64u);
+    each row, block: if is_own(at, {row}u) { store_sums(sums_{row}_{block}, ({row}u * 2u + {block}u) * 64u); }
     workgroupBarrier();
-    each row, block: let skip_{row}_{block} = skipped(group + 4u * {block}u, x, first_y + {row}u);
-    each row, block: finish({row}u * 2u + {block}u, skip_{row}_{block}, group + 4u * {block}u, x, first_y + {row}u);
+    for (var row = first_row; row < ROWS; row += THREADS / 32u) {
+        each block: finish(row * 2u + {block}u, skipped(group + 4u * {block}u, x, first_y + row), group + 4u * {block}u, x, first_y + row);
+    }
 }

@@ -8,9 +8,9 @@ use crate::optics::double_phase::{CORRECTION_GAIN, DARK_SHARE, LEAST_DARK, MOST_
 
 /// Blocks of 4x4 pixels of a workgroup of the entry point `phases`, with one at each edge that it shares with others.
 const BLOCKS_ACROSS: usize = 16;
-const BLOCKS_DOWN: usize = 8;
+const BLOCKS_DOWN: usize = 16;
 /// Strips of columns that its threads do.
-const STRIPS: usize = 2;
+const STRIPS: usize = 4;
 
 /// Adds the stage `double phase`: the phases [3, height, width] of the hologram, of which `clipped` counts the samples
 /// that exceed `amplitude_constant`. Returns the phases' buffer, radians in [0, 2π).

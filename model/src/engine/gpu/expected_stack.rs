@@ -303,6 +303,7 @@ mod tests {
             (Format::Half, 5, false, 286, 9),
             (Format::Half, 9, true, 17, 12),
             (Format::HalfTiles(MatrixUnits::Threads), 6, true, 19, 34),
+            (Format::HalfTiles(MatrixUnits::ThreadsOfAnySubgroups { in_one: true }), 3, true, 21, 14),
         ] {
             let weights = random_weights(config(depth_layers, refined_stack), 3);
             check_on(bench, LIMITS, format, &weights, Resolution { width, height }, 3.3, 5);

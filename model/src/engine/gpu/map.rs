@@ -1,5 +1,6 @@
 //! Feature maps on the GPU.
 
+use super::matrix;
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan};
 use crate::engine::Precision;
 use crate::gpu::MatrixUnits;
@@ -34,9 +35,13 @@ impl Format {
     }
 
     /// Of what a net with features in this format gives: sums of matrices that are no features leave it in single
-    /// precision.
+    /// precision, but where bytes are what counts.
     pub(crate) fn of_outputs(self) -> Self {
-        if let Self::HalfTiles(_) = self { Self::Single } else { self }
+        match self {
+            Self::HalfTiles(units) if matrix::of_any_subgroups(units) => Self::Half,
+            Self::HalfTiles(_) => Self::Single,
+            _ => self,
+        }
     }
 
     pub(crate) fn precision(self) -> Precision {

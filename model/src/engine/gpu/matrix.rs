@@ -1,6 +1,6 @@
 //! Shaders that multiply matrices, and how their weights lie.
 
-use super::map::{Format, GROUP, Map, TILE};
+use super::map::{Format, GROUP, Map, ROWS, TILE};
 use super::plan::ENABLE_F16;
 use crate::gpu::MatrixUnits;
 
@@ -14,12 +14,15 @@ pub(super) struct TilePacking {
     pub(super) parts: usize,
     /// Pairs of matrices of weights in a part.
     steps: usize,
+    /// Whether the inputs of each output lie together.
+    by_output: bool,
 }
 
 impl TilePacking {
-    /// Of a layer that writes `output_groups` and goes through `steps` pairs of matrices for each part.
-    pub(super) fn new(output_groups: usize, steps: usize) -> Self {
-        Self { parts: (output_groups * GROUP).div_ceil(PART_BLOCKS * TILE), steps }
+    /// Of a layer that writes `output_groups` on `units` and goes through `steps` pairs of matrices for each part.
+    pub(super) fn new(units: MatrixUnits, output_groups: usize, steps: usize) -> Self {
+        let by_output = weights_by_output(units);
+        Self { parts: (output_groups * GROUP).div_ceil(PART_BLOCKS * TILE), steps, by_output }
     }
 
     pub(super) fn len(self) -> usize {
@@ -35,35 +38,82 @@ impl TilePacking {
     pub(super) fn place(self, output: usize, step: usize, input: usize) -> usize {
         let (part, block) = (output / TILE / PART_BLOCKS, output / TILE % PART_BLOCKS);
         let matrix = (part * self.steps + step) * PART_BLOCKS + block;
-        (self.parts * PART_BLOCKS + matrix * TILE + input % TILE) * TILE + output % TILE
+        let (input, output) = (input % TILE, output % TILE);
+        let (row, column) = if self.by_output { (output, input) } else { (input, output) };
+        (self.parts * PART_BLOCKS + matrix * TILE + row) * TILE + column
     }
 }
 
-/// Rows that a workgroup makes.
+/// Rows that a workgroup makes of a plain layer.
 pub(super) fn rows(units: MatrixUnits) -> usize {
     match units {
         MatrixUnits::Device => 3,
+        MatrixUnits::DeviceOfAnySubgroups => ROWS,
         // More would be compiled for many seconds.
         #[cfg(test)]
         MatrixUnits::Threads => 2,
+        #[cfg(test)]
+        MatrixUnits::ThreadsOfAnySubgroups { .. } => ROWS,
+    }
+}
+
+/// Whether a plain layer makes half of the products, as [`winograd`](super::winograd) does. Cards of RDNA 3 do so: their
+/// units take longer for all of the products than their memory for the maps.
+pub(super) fn by_points(units: MatrixUnits) -> bool {
+    of_any_subgroups(units)
+}
+
+/// Whether the inputs of each output lie together. Cards of RDNA 3 hold them in one thread, and read them at once.
+fn weights_by_output(units: MatrixUnits) -> bool {
+    of_any_subgroups(units)
+}
+
+/// Whether the driver chooses between subgroups of 32 and 64 threads.
+pub(super) fn of_any_subgroups(units: MatrixUnits) -> bool {
+    match units {
+        MatrixUnits::Device => false,
+        MatrixUnits::DeviceOfAnySubgroups => true,
+        #[cfg(test)]
+        MatrixUnits::Threads => false,
+        #[cfg(test)]
+        MatrixUnits::ThreadsOfAnySubgroups { .. } => true,
     }
 }
 
 /// A shader that multiplies on `units` the pixels that lie in `memory`, for workgroups of `rows`.
 pub(super) fn source(output: &Map, units: MatrixUnits, memory: &str, rows: usize, files: &[&str]) -> String {
-    let (extension, products) = match units {
-        MatrixUnits::Device => ("enable wgpu_cooperative_matrix;\n", include_str!("matrix_units.wgsl")),
+    const EXTENSION: &str = "enable wgpu_cooperative_matrix;\n";
+    const PRODUCTS: &str = include_str!("matrix_units.wgsl");
+    let (extension, products, subgroups) = match units {
+        MatrixUnits::Device => (EXTENSION, PRODUCTS, include_str!("subgroups_of_32.wgsl").to_owned()),
+        MatrixUnits::DeviceOfAnySubgroups => {
+            (EXTENSION, PRODUCTS, include_str!("subgroups_of_any_size.wgsl").to_owned())
+        }
         #[cfg(test)]
-        MatrixUnits::Threads => ("", include_str!("matrix_threads.wgsl")),
+        MatrixUnits::Threads => {
+            ("", include_str!("matrix_threads.wgsl"), include_str!("subgroups_of_32.wgsl").to_owned())
+        }
+        #[cfg(test)]
+        MatrixUnits::ThreadsOfAnySubgroups { in_one } => {
+            let how = format!("const IN_ONE_SUBGROUP = {in_one};\n{}", include_str!("subgroups_of_threads.wgsl"));
+            ("", include_str!("matrix_threads.wgsl"), how)
+        }
     };
+    let threads = if of_any_subgroups(units) { 64 } else { 32 };
+    let mut constants =
+        format!("const THREADS = {threads}u;\nconst WEIGHTS_BY_OUTPUT = {};\n", weights_by_output(units));
     let store = match output.format {
-        Format::Single => include_str!("store_groups.wgsl"),
+        Format::Single | Format::Half => {
+            constants.push_str(&format!("alias OutVector = {};\n", output.format.precision().vector()));
+            include_str!("store_groups.wgsl")
+        }
         Format::HalfTiles(_) => include_str!("store_tile.wgsl"),
-        Format::Half => unreachable!("a layer of matrices writes such, or single precision"),
     };
     let text = [
+        &constants,
         include_str!("epilogue.wgsl"),
         store,
+        &subgroups,
         &products.replace("MEMORY", memory),
         include_str!("finish_matrix.wgsl"),
         &files.concat(),
@@ -118,13 +168,15 @@ mod tests {
 
     #[test]
     fn every_weight_has_a_place_of_its_own_behind_the_biases() {
-        let packing = TilePacking::new(12, 3);
-        let mut places: Vec<_> = (0..48)
-            .flat_map(|output| (0..3 * TILE).map(move |input| packing.place(output, input / TILE, input)))
-            .collect();
-        places.sort_unstable();
-        places.dedup();
-        assert_eq!((places.len(), places[0], packing.parts), (48 * 3 * TILE, 64, 2));
-        assert!(*places.last().expect("places") < packing.len());
+        for units in [MatrixUnits::Device, MatrixUnits::DeviceOfAnySubgroups] {
+            let packing = TilePacking::new(units, 12, 3);
+            let mut places: Vec<_> = (0..48)
+                .flat_map(|output| (0..3 * TILE).map(move |input| packing.place(output, input / TILE, input)))
+                .collect();
+            places.sort_unstable();
+            places.dedup();
+            assert_eq!((places.len(), places[0], packing.parts), (48 * 3 * TILE, 64, 2));
+            assert!(*places.last().expect("places") < packing.len());
+        }
     }
 }

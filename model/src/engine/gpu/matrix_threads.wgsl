@@ -10,7 +10,22 @@ fn load_pixels(place: u32) -> Pixels {
 }
 
 fn load_weights(place: u32) -> Weights {
-    return place + lane % 2u * 2u;
+    return place;
+}
+
+// Of one input channel, the weights of the outputs of group `group` in the matrix at `place`.
+fn weights_of(place: u32, channel: u32, group: u32) -> vec4f {
+    if WEIGHTS_BY_OUTPUT {
+        let first = place + 16u * group + channel / 4u;
+        let at = channel % 4u;
+        return vec4f(
+            f32(parameters[first][at]),
+            f32(parameters[first + 4u][at]),
+            f32(parameters[first + 8u][at]),
+            f32(parameters[first + 12u][at]),
+        );
+    }
+    return vec4f(parameters[place + 4u * channel + group]);
 }
 
 fn multiply_add(pixels: Pixels, weights: Weights, sums: Sums) -> Sums {
@@ -20,10 +35,18 @@ fn multiply_add(pixels: Pixels, weights: Weights, sums: Sums) -> Sums {
     let channels = 16u + lane / 32u;
     for (var channel = 0u; channel < channels; channel++) {
         let value = vec4f(vec4<f16>(MEMORY[pixels + channel / 4u][channel % 4u]));
-        low = fma(value, vec4f(parameters[weights + 4u * channel]), low);
-        high = fma(value, vec4f(parameters[weights + 4u * channel + 1u]), high);
+        low = fma(value, weights_of(weights, channel, lane % 2u * 2u), low);
+        high = fma(value, weights_of(weights, channel, lane % 2u * 2u + 1u), high);
     }
     return array(low, high);
+}
+
+fn combined(factor: f32, a: Sums, b: Sums) -> Sums {
+    return array(factor * a[0] + b[0], factor * a[1] + b[1]);
+}
+
+fn scaled(factor: f32, a: Sums) -> Sums {
+    return array(factor * a[0], factor * a[1]);
 }
 
 fn store_sums(sums: Sums, place: u32) {

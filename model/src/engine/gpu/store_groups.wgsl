@@ -1,13 +1,12 @@
-// As store_tile.wgsl, in an output of groups in single precision, each of which may be missing.
+// As store_tile.wgsl, in an output of groups, each of which may be missing. Before this file: OutVector.
 
-alias OutVector = vec4f;
 alias Skipped = array<vec4f, 2>;
 
 fn skipped(group: u32, x: u32, y: u32) -> Skipped {
     var skip: Skipped;
     if RESIDUAL && x < WIDTH && y < HEIGHT {
         for (var part = 0u; part < 2u && group + part < OUT_GROUPS; part++) {
-            skip[part] = output[output_place(group + part, x, y)];
+            skip[part] = vec4f(output[output_place(group + part, x, y)]);
         }
     }
     return skip;
@@ -16,7 +15,7 @@ fn skipped(group: u32, x: u32, y: u32) -> Skipped {
 fn store(sums: array<vec4f, 2>, skip: Skipped, group: u32, x: u32, y: u32) {
     if x < WIDTH && y < HEIGHT {
         for (var part = 0u; part < 2u && group + part < OUT_GROUPS; part++) {
-            output[output_place(group + part, x, y)] = activated(sums[part], skip[part]);
+            output[output_place(group + part, x, y)] = OutVector(activated(sums[part], skip[part]));
         }
     }
 }

@@ -396,15 +396,22 @@ fn assert_near_single(half: &mut GpuEngine, weights: &Weights, bench: &DisplayGe
 fn a_whole_network_of_matrices_is_near_the_same_in_single_precision() {
     let frame = Arc::new(frame(SIZE, 4));
     let weights = Weights::builtin_fast();
-    let mut matrices = of_matrices(&weights, frame.resolution);
-    assert!(matrices.uses_matrix_units(), "it is left to the device");
-    assert_near_single(&mut matrices, &weights, &DisplayGeometry::DEFAULT, &frame);
+    for units in [matrix_units(), MatrixUnits::ThreadsOfAnySubgroups { in_one: false }] {
+        let mut matrices = of_matrices(units, &weights, frame.resolution);
+        assert!(matrices.uses_matrix_units(), "it is left to the device");
+        assert_near_single(&mut matrices, &weights, &DisplayGeometry::DEFAULT, &frame);
+    }
 }
 
-/// An engine on the default bench that multiplies matrices.
-fn of_matrices(weights: &Weights, resolution: Resolution) -> GpuEngine {
+/// Those of the device that tests run on, or threads.
+fn matrix_units() -> MatrixUnits {
+    test_gpu().matrix_units.unwrap_or(MatrixUnits::Threads)
+}
+
+/// An engine on the default bench that multiplies matrices on `units`.
+fn of_matrices(units: MatrixUnits, weights: &Weights, resolution: Resolution) -> GpuEngine {
     let mut gpu = test_gpu();
-    gpu.matrix_units.get_or_insert(MatrixUnits::Threads);
+    gpu.matrix_units = Some(units);
     let tables = linear_tables(resolution);
     GpuEngine::on(gpu, weights, &DisplayGeometry::DEFAULT, &tables, None).expect("an engine")
 }
@@ -415,7 +422,6 @@ fn shaders_for_matrix_units_are_valid() {
     use wgpu::naga;
     let limits = WorkgroupLimits { bytes: 32 << 10, threads: 512 };
     let tables = linear_tables(Resolution { width: 50, height: 34 });
-    let features = Features { format: Format::HalfTiles(MatrixUnits::Device), method: Method::Winograd };
     let valid = |source: &str| -> Result<(), String> {
         let capabilities = naga::valid::Capabilities::all();
         let options = naga::front::wgsl::Options { capabilities, ..naga::front::wgsl::Options::new() };
@@ -426,9 +432,12 @@ fn shaders_for_matrix_units_are_valid() {
         Ok(())
     };
     let mut with_matrices = 0;
-    for weights in [Weights::builtin(), Weights::builtin_small(), Weights::builtin_fast()] {
+    let networks = [Weights::builtin(), Weights::builtin_small(), Weights::builtin_fast()];
+    let all_units = [MatrixUnits::Device, MatrixUnits::DeviceOfAnySubgroups];
+    for (weights, units) in networks.iter().flat_map(|weights| all_units.map(|units| (weights, units))) {
         let bench = DisplayGeometry::DEFAULT;
-        let network = super::network::NetworkPlan::new(&weights, &bench, &tables, features, limits).expect("a plan");
+        let features = Features { format: Format::HalfTiles(units), method: Method::Winograd };
+        let network = super::network::NetworkPlan::new(weights, &bench, &tables, features, limits).expect("a plan");
         for shader in network.plan.stages.iter().flat_map(|stage| &stage.dispatches).map(|dispatch| &dispatch.shader) {
             valid(&shader.source).unwrap_or_else(|error| panic!("{}: {error}", shader.label));
             if shader.source.contains("coopMultiplyAdd") {
@@ -438,7 +447,7 @@ fn shaders_for_matrix_units_are_valid() {
             }
         }
     }
-    assert!(with_matrices > 30, "{with_matrices}");
+    assert!(with_matrices > 60, "{with_matrices}");
 }
 
 #[test]
@@ -498,8 +507,8 @@ fn what_is_no_number_leaves_no_trace_in_the_next_frame() {
     for mut engine in [
         on_default(&direct),
         on_default(&Weights::builtin_small()),
-        of_matrices(&direct, SIZE),
-        of_matrices(&Weights::builtin_fast(), SIZE),
+        of_matrices(matrix_units(), &direct, SIZE),
+        of_matrices(matrix_units(), &Weights::builtin_fast(), SIZE),
     ] {
         let given = |spoil: &dyn Fn(&mut RgbdFrame)| {
             let mut frame = frame(SIZE, 4);

@@ -21,6 +21,11 @@ pub(super) fn source(number: &str, text: &str) -> String {
     format!("alias Number = {number};\nalias Vector = vec4<Number>;\n\n{}\n{text}", include_str!("winograd.wgsl"))
 }
 
+/// The same with `winograd_rows.wgsl`.
+pub(super) fn source_with_rows(number: &str, text: &str) -> String {
+    source(number, &[include_str!("winograd_rows.wgsl"), "\n", text].concat())
+}
+
 /// Three weights of a line at the points, with the factors by which the outputs are found from products there.
 pub(super) fn at_points(weights: [f32; 3]) -> [f32; POINTS] {
     let [first, second, third] = weights;

@@ -32,6 +32,7 @@ use super::plan::{Dispatch, Plan, Shader};
 use super::trunk::Features;
 use crate::Weights;
 use crate::engine::EngineError;
+use crate::gpu::MatrixUnits;
 
 pub use self::null_device::serve;
 
@@ -82,6 +83,12 @@ pub enum CostError {
         driver = driver.display()
     )]
     NoNullDevice { card: &'static str, driver: PathBuf, said: String },
+    /// The card, or the driver, multiplies no matrices.
+    #[error(
+        "{driver} lists no matrices of 16x16x16 numbers of half precision for the {card}; \
+         expected a card of RDNA 3, and Mesa 25.0 (mesa-vulkan-drivers of Debian 13)"
+    )]
+    NoMatrices { card: &'static str, driver: String },
     /// The program that runs the compiler does not start.
     #[error("{program} cannot be started: {source}", program = program.display())]
     Process {
@@ -213,14 +220,28 @@ struct Compiled {
 /// What is done for one frame: a network, double phase and levels.
 pub struct FramePlan(Plan);
 
+/// Of what features are, and so most products.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Products {
+    /// Vectors in single precision.
+    Single,
+    /// Vectors in half precision, two at once.
+    Half,
+    /// Matrices in half precision, on units of their own.
+    Matrices,
+}
+
 impl FramePlan {
-    /// The plan of `weights` on the default bench at `resolution`; `half_precision` is that of features, and so of most
-    /// products.
+    /// The plan of `weights` on the default bench at `resolution`.
     ///
     /// # Errors
     /// The size is nothing, or too large.
-    pub fn new(weights: &Weights, resolution: Resolution, half_precision: bool) -> Result<Self, EngineError> {
-        let format = if half_precision { Format::Half } else { Format::Single };
+    pub fn new(weights: &Weights, resolution: Resolution, products: Products) -> Result<Self, EngineError> {
+        let format = match products {
+            Products::Single => Format::Single,
+            Products::Half => Format::Half,
+            Products::Matrices => Format::HalfTiles(MatrixUnits::DeviceOfAnySubgroups),
+        };
         let features = Features { format, method: Method::Winograd };
         // A panel of 8 bits.
         let levels = [0; 3].map(|_| (0..256).collect());
@@ -261,7 +282,19 @@ impl Compiler {
 
     /// What the driver calls its device.
     pub fn device(&self) -> &str {
-        &self.device.name
+        &self.device.opened.name
+    }
+
+    /// Whether it can compile what multiplies so.
+    ///
+    /// # Errors
+    /// Matrices are asked for, and the driver has none for the card.
+    pub fn check(&self, products: Products) -> Result<(), CostError> {
+        let null_device::Opened { has_matrices, driver, .. } = &self.device.opened;
+        if products == Products::Matrices && !has_matrices {
+            return Err(CostError::NoMatrices { card: self.card.name, driver: driver.clone() });
+        }
+        Ok(())
     }
 
     /// What one frame costs.

@@ -46,8 +46,18 @@ pub(super) struct NullDevice {
     process: Child,
     requests: ChildStdin,
     answers: io::BufReader<ChildStdout>,
+    pub(super) opened: Opened,
+}
+
+/// What the process says of the device first.
+#[derive(Serialize, Deserialize)]
+pub(super) struct Opened {
     /// As the driver has it.
     pub(super) name: String,
+    /// The driver and its version.
+    pub(super) driver: String,
+    /// Whether it multiplies matrices as the shaders for matrix units do.
+    pub(super) has_matrices: bool,
 }
 
 impl NullDevice {
@@ -75,9 +85,9 @@ impl NullDevice {
             let mut answers = io::BufReader::new(process.stdout.take().expect("it is piped"));
             let mut line = String::new();
             if answers.read_line(&mut line).is_ok()
-                && let Ok(Ok(name)) = serde_json::from_str::<Result<String, String>>(&line)
+                && let Ok(Ok(opened)) = serde_json::from_str::<Result<Opened, String>>(&line)
             {
-                return Ok(Self { process, requests, answers, name });
+                return Ok(Self { process, requests, answers, opened });
             }
             drop(requests);
             let output = process.wait_with_output().map(|output| output.stderr).unwrap_or_default();
@@ -122,7 +132,7 @@ fn driver() -> Option<PathBuf> {
     files.into_iter().min()
 }
 
-/// Tells the device's name, then answers one request after another with what the driver made of it.
+/// Tells what device there is, then answers one request after another with what the driver made of it.
 ///
 /// # Errors
 /// Standard input or output fail.
@@ -130,8 +140,8 @@ pub fn serve() -> io::Result<()> {
     let mut out = io::stdout().lock();
     let mut say = |answer: String| writeln!(out, "{answer}").and_then(|()| out.flush());
     let compiler = Compiler::open();
-    let name = compiler.as_ref().map(|compiler| &compiler.name);
-    say(serde_json::to_string(&name).expect("a name is plain data"))?;
+    let opened = compiler.as_ref().map(|compiler| &compiler.opened);
+    say(serde_json::to_string(&opened).expect("it is plain data"))?;
     let Ok(compiler) = compiler else { return Ok(()) };
     for line in io::stdin().lines() {
         let answer = serde_json::from_str(&line?)
@@ -144,7 +154,7 @@ pub fn serve() -> io::Result<()> {
 
 /// The driver's device.
 struct Compiler {
-    name: String,
+    opened: Opened,
     device: ash::Device,
     executables: ash::khr::pipeline_executable_properties::Device,
     instance: ash::Instance,
@@ -166,14 +176,18 @@ impl Compiler {
                 .map_err(says)
                 .and_then(|devices| devices.first().copied().ok_or_else(|| "there is no device".to_owned()));
             let opened = found.and_then(|physical| {
-                let properties = instance.get_physical_device_properties(physical);
-                let name = properties.device_name_as_c_str().unwrap_or(c"?").to_string_lossy().into_owned();
-                Ok((name, device(&instance, physical).map_err(says)?))
+                let mut drivers = vk::PhysicalDeviceDriverProperties::default();
+                let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut drivers);
+                instance.get_physical_device_properties2(physical, &mut properties);
+                let name = text(&properties.properties.device_name);
+                let has_matrices = has_matrices(&entry, &instance, physical).map_err(says)?;
+                let opened = Opened { name, driver: text(&drivers.driver_info), has_matrices };
+                Ok((opened, device(&instance, physical).map_err(says)?))
             });
             match opened {
-                Ok((name, device)) => {
+                Ok((opened, device)) => {
                     let executables = ash::khr::pipeline_executable_properties::Device::new(&instance, &device);
-                    Ok(Self { name, device, executables, instance, _entry: entry })
+                    Ok(Self { opened, device, executables, instance, _entry: entry })
                 }
                 Err(reason) => {
                     instance.destroy_instance(None);
@@ -267,6 +281,33 @@ impl Drop for Compiler {
             self.instance.destroy_instance(None);
         }
     }
+}
+
+/// Whether the device has matrices of 16 by 16 numbers of half precision that a subgroup multiplies, and sums up in
+/// single precision.
+///
+/// # Safety
+/// `physical` is a device of `instance`.
+unsafe fn has_matrices(
+    entry: &ash::Entry,
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+) -> Result<bool, vk::Result> {
+    // SAFETY: the caller's promise.
+    let offered = unsafe { instance.enumerate_device_extension_properties(physical)? };
+    let name = ash::khr::cooperative_matrix::NAME;
+    if !offered.iter().any(|found| found.extension_name_as_c_str() == Ok(name)) {
+        return Ok(false);
+    }
+    let matrices = ash::khr::cooperative_matrix::Instance::new(entry, instance);
+    // SAFETY: the caller's promise, and the driver has the extension.
+    let kinds = unsafe { matrices.get_physical_device_cooperative_matrix_properties(physical)? };
+    let (half, single) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
+    Ok(kinds.iter().any(|kind| {
+        (kind.m_size, kind.n_size, kind.k_size) == (16, 16, 16)
+            && (kind.a_type, kind.b_type, kind.c_type, kind.result_type) == (half, half, single, single)
+            && kind.scope == vk::ScopeKHR::SUBGROUP
+    }))
 }
 
 /// A device with every feature that the driver offers, among them those by which wgpu has accesses checked.
