@@ -423,6 +423,14 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn units_that_have_run_on_no_card_are_taken_where_asked_for_and_by_wide_networks_alone() {
+        let of_any_size = MatrixUnits::DeviceOfAnySubgroups;
+        assert_eq!([MatrixUnits::Device, of_any_size].map(MatrixUnits::have_run), [true, false]);
+        assert_eq!([16, 24, 32].map(|channels| MatrixUnits::Device.suit(channels)), [true; 3]);
+        assert_eq!([16, 24, 32].map(|channels| of_any_size.suit(channels)), [false, false, true]);
+    }
+
+    #[test]
     fn what_is_uploaded_is_read_back() {
         let gpu = test_gpu();
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;

@@ -54,6 +54,20 @@ pub(crate) enum MatrixUnits {
     ThreadsOfAnySubgroups { in_one: bool },
 }
 
+#[cfg(feature = "gpu")]
+impl MatrixUnits {
+    /// Whether networks have run with them on a card, so that an engine may take them unasked.
+    pub(crate) fn have_run(self) -> bool {
+        self != Self::DeviceOfAnySubgroups
+    }
+
+    /// Whether layers of so many channels take less time with them than in packed half precision: subgroups of any size
+    /// make 32 outputs at once.
+    pub(crate) fn suit(self, channels: usize) -> bool {
+        self != Self::DeviceOfAnySubgroups || channels >= 32
+    }
+}
+
 /// The name of the device among `adapters` that an engine would take.
 ///
 /// # Errors

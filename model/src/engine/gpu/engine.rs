@@ -17,7 +17,7 @@ use super::plan::{Plan, Stage};
 use super::shared::pupil_values;
 use super::trunk::Features;
 use crate::engine::{EngineError, Precision, StageTiming, StageTimings, check_pupil};
-use crate::gpu::{Gpu, GpuChoice, GpuError, first_that_opens};
+use crate::gpu::{Gpu, GpuChoice, GpuError, MatrixUnits, first_that_opens};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
 /// Network, double phase and levels on the GPU, for frames of one size and one panel.
@@ -25,7 +25,7 @@ pub struct GpuEngine {
     gpu: Gpu,
     network: NetworkPlan,
     loaded: LoadedPlan,
-    precision: Precision,
+    format: Format,
     /// Why it multiplies no matrices though that was tried.
     refused_matrices: Option<GpuError>,
     timestamps: Option<Timestamps>,
@@ -99,11 +99,12 @@ impl GpuEngine {
     ) -> Result<Self, EngineError> {
         let precision = match precision {
             Some(precision) if gpu.half_precision => precision,
-            None if gpu.matrix_units.is_some() => Precision::Half,
+            None if gpu.matrix_units.is_some_and(MatrixUnits::have_run) => Precision::Half,
             _ => Precision::Single,
         };
+        let matrix_units = gpu.matrix_units.filter(|units| units.suit(weights.config().channels));
         let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
-        let format = Format::of(precision, gpu.matrix_units);
+        let format = Format::of(precision, matrix_units);
         let features = Features { format, method: Method::of_vendor(gpu.vendor) };
         let mut network = NetworkPlan::new(weights, bench, tables, features, limits)?;
         let plan = &network.plan;
@@ -134,7 +135,7 @@ impl GpuEngine {
             gpu,
             network,
             loaded,
-            precision,
+            format,
             refused_matrices: None,
             timestamps,
             uploaded: None,
@@ -155,12 +156,12 @@ impl GpuEngine {
 
     /// What its features are.
     pub fn precision(&self) -> Precision {
-        self.precision
+        self.format.precision()
     }
 
     /// Whether layers multiply on units of the device that multiply matrices.
     pub fn uses_matrix_units(&self) -> bool {
-        self.precision == Precision::Half && self.gpu.matrix_units.is_some()
+        matches!(self.format, Format::HalfTiles(_))
     }
 
     /// Why it does without such units, where the device failed with them.
