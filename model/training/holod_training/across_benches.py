@@ -23,7 +23,7 @@ from holod_training.judging import (
     open_alike,
     rivals,
 )
-from holod_training.metrics import SSIM_WINDOW_PX
+from holod_training.metrics import SSIM_WINDOW_PX, Judgement
 from holod_training.network import FieldNetwork
 from holod_training.refocus import refocus_cards
 from holod_training.report import prose
@@ -58,13 +58,7 @@ def across_benches(
     for _, shards in benches:
         check_border(shards, border_px, "--border-px", SSIM_WINDOW_PX)
     cards = _open_cards(card_folders, {name: shards[0].optics for name, shards in benches}, border_px)
-    judged = {
-        name: {
-            key: _judge(key, network, shards, cards.get(name, []), border_px, device)
-            for key, network in networks.items()
-        }
-        for name, shards in benches
-    }
+    judged = {name: _judge(networks, name, shards, cards.get(name, []), border_px, device) for name, shards in benches}
     result = {
         "border_px": border_px,
         "networks": [
@@ -125,20 +119,30 @@ def _open_cards(folders: Sequence[Path], benches: dict[str, OpticsConfig], borde
 
 
 def _judge(
+    networks: dict[str, FieldNetwork],
     name: str,
-    network: FieldNetwork,
     shards: list[Shard],
     cards: list[Shard],
     border_px: int,
     device: torch.device | str,
-) -> tuple[Judged, list[dict[str, Any]]]:
-    """One network, which is called `OURS`, and the rival; and their refocus ratios."""
+) -> dict[str, tuple[Judged, list[dict[str, Any]]]]:
+    """Each network, which is called `OURS` then, beside the rival; and their refocus ratios."""
     optics = shards[0].optics
-    bench = Bench(optics, network.config.amplitude_constant, border_px, device)
-    methods = [network_method(OURS, network.on(optics)), *(one for one in rivals(optics) if one.name == RIVAL)]
-    print(f"{name}, {len(shards)} scenes", flush=True)
-    refocus = refocus_cards(cards, methods, bench, pupils_mm=shards[0].pupils_mm) if cards else []
-    return judge_scenes(shards, methods, bench), refocus
+    rival = [method for method in rivals(optics) if method.name == RIVAL]
+    # By the amplitude constant with which it is shown.
+    of_rival: dict[float, dict[tuple[str, str, float], dict[int, Judgement]]] = {}
+    found: dict[str, tuple[Judged, list[dict[str, Any]]]] = {}
+    for key, network in networks.items():
+        print(f"{name}, {key}: {len(shards)} scenes", flush=True)
+        constant = network.config.amplitude_constant
+        bench = Bench(optics, constant, border_px, device)
+        methods = [network_method(OURS, network.on(optics)), *([] if constant in of_rival else rival)]
+        refocus = refocus_cards(cards, methods, bench, pupils_mm=shards[0].pupils_mm) if cards else []
+        judged = judge_scenes(shards, methods, bench, after_alone=True)
+        of_rival.setdefault(constant, {of: values for of, values in judged.values.items() if of[0] == RIVAL})
+        judged.values.update(of_rival[constant])
+        found[key] = judged, refocus
+    return found
 
 
 def _bench(name: str, shards: list[Shard], found: dict[str, tuple[Judged, list[dict[str, Any]]]]) -> dict[str, Any]:

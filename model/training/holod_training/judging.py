@@ -225,8 +225,8 @@ class Judged:
 
     pupils_mm: tuple[float, ...]
     matrix_pupils_mm: list[float]
+    matrix: dict[str, list[np.ndarray]]
     values: dict[tuple[str, str, float], dict[int, Judgement]] = field(default_factory=dict)
-    matrix: dict[str, list[np.ndarray]] = field(default_factory=lambda: {BEFORE: [], AFTER: []})
     clipped: dict[tuple[str, float], list[float]] = field(default_factory=dict)
     amplitudes: list[Tensor] = field(default_factory=list)
 
@@ -300,13 +300,15 @@ def _intervals(numbers: dict[str, list[float]]) -> dict[str, list[float]]:
     return {name: list(interval) for name, interval in found.items() if interval}
 
 
-def judge_scenes(shards: list[Shard], methods: list[Method], bench: Bench) -> Judged:
-    """Every method at every pupil, and for ours the matrix PSNR(given, judged); one scene in memory at a time. Raises
-    ShardError and JudgementError for scenes and pictures with values that are no numbers."""
+def judge_scenes(shards: list[Shard], methods: list[Method], bench: Bench, after_alone: bool = False) -> Judged:
+    """Every method at every pupil, and for ours the matrix PSNR(given, judged); one scene in memory at a time. With
+    `after_alone` neither fields before double phase nor the two references that are no holograms, in a quarter of the
+    time. Raises ShardError and JudgementError for scenes and pictures with values that are no numbers."""
     pupils = shards[0].pupils_mm
-    judged = Judged(pupils, table_pupils(pupils))
+    stages = (AFTER,) if after_alone else (BEFORE, AFTER)
+    judged = Judged(pupils, table_pupils(pupils), matrix={stage: [] for stage in stages})
     for scene, shard in enumerate(tqdm(shards, unit="scene", disable=None)):
-        for index in range(len(pupils)):
+        for index in range(0 if after_alone else len(pupils)):
             stack = bench.read_judged(shard, index)
             blurred = rgbd_blur(stack.amplitude, stack.depth, bench.optics, list(stack.focus_dpt), stack.pupil_mm)
             judged.add(RGBD_BLUR, BEFORE, stack.pupil_mm, scene, bench.judge(blurred, stack))
@@ -330,7 +332,8 @@ def _judge_method(judged: Judged, scene: int, shard: Shard, method: Method, benc
         crossed = [i for i, p in enumerate(judged.pupils_mm) if given_mm in of_matrix and p in of_matrix and i != given]
         for index in wanted:
             judged.clipped.setdefault((method.name, judged.pupils_mm[index]), []).append(share)
-        for stage, shown in ((BEFORE, field_), (AFTER, panel)):
+        for stage in psnr:
+            shown = panel if stage == AFTER else field_
             picture, seen_with = None, 0.0
             for index in sorted(wanted + crossed):
                 pupil = judged.pupils_mm[index]

@@ -418,6 +418,18 @@ def test_a_method_that_gives_no_numbers_is_told_and_not_left_out(evaluation: Pat
         judge_scenes([shard], [Method("failing", field, adapts=True)], Bench(OPTICS, 1.25, 8))
 
 
+def test_what_is_judged_after_double_phase_alone_is_the_same(evaluation: Path) -> None:
+    def field(stack: Stack, pupil_mm: float) -> torch.Tensor:
+        return all_in_focus(stack.amplitude, stack.depth, OPTICS)
+
+    shard = Shard(evaluation / "test" / "scene_000001.safetensors")
+    methods, bench = [Method("holod", field, adapts=True)], Bench(OPTICS, 1.25, 8)
+    every, alone = (judge_scenes([shard], methods, bench, after_alone) for after_alone in (False, True))
+    after = {of: found for of, found in every.values.items() if of[:2] == ("holod", "after")}
+    assert alone.values == after and 0 < len(after) < len(every.values)
+    assert alone.summary()["matrix_psnr_db"] == {"after": every.summary()["matrix_psnr_db"]["after"]}
+
+
 def test_a_bench_that_weights_are_not_for_is_told(evaluation: Path, tmp_path: Path, capsys) -> None:
     """Refused where `holod evaluate` does, noted where it warns."""
     weights, trained = tmp_path / "w.safetensors", {"near": (40.0, 60.0), "far": (140.0, 400.0)}

@@ -701,15 +701,15 @@ def test_a_device_is_offered_where_it_is_used(
     judged = ["--weights", str(tmp_path / "w.safetensors"), "--test", str(shards), "--limit", "1"]
     seen: list[torch.device] = []
 
-    def blur(amplitude: torch.Tensor, *_: object) -> None:
-        seen.append(amplitude.device)
+    def render(network: object, stack: Stack, pupil_mm: float) -> None:
+        seen.append(stack.depth.device)
         raise ShardError("seen")
 
     def study(stacks: list[Stack], *_: object) -> None:
         seen.append(stacks[0].depth.device)
         raise ShardError("seen")
 
-    monkeypatch.setattr("holod_training.judging.rgbd_blur", blur)
+    monkeypatch.setattr("holod_training.judging.network_field", render)
     monkeypatch.setattr("holod_training.eyebox.study", study)
     # A device that needs no machine: it has shapes and no values.
     monkeypatch.setattr(cli, "choose_device", lambda name: torch.device("meta" if name == "cuda" else name))
