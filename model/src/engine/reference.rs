@@ -9,6 +9,7 @@ use num_complex::Complex64;
 
 use crate::RgbdFrame;
 use crate::conditions::Conditions;
+use crate::engine::constants::LAYER_SHIFTS;
 use crate::scene::FocalStack;
 use crate::weights::{Adjustable, Dense, Family, Grid, Layer, NetworkConfig, Weights};
 
@@ -363,7 +364,7 @@ fn layer_of(weights: &Weights, frame: &RgbdFrame, y: usize, x: usize) -> usize {
     let Resolution { width, height } = frame.resolution;
     let count = weights.config.depth_layers;
     let depth = frame.depth_normalised[y.min(height - 1) * width + x.min(width - 1)];
-    ((depth * count as f32) as usize).min(count - 1)
+    ((depth * count as f32 + LAYER_SHIFTS[y % 2 * 2 + x % 2]) as usize).min(count - 1)
 }
 
 /// The share of block `index` whose pixels lie in `layer`.

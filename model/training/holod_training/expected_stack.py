@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from holod_training.config import NetworkConfig, OpticsConfig
-from holod_training.layered import encode, layer_centres_m, layer_numbers
+from holod_training.layered import encode, layer_centres_m
 from holod_training.network import (
     CONDITIONS,
     OUTPUT_CHANNELS,
@@ -28,14 +28,22 @@ LEAST_COVER = 0.02
 # Below it a disc's spectrum is 1.
 LEAST_ARGUMENT = 1e-3
 SHARPNESS = 1.0
+# Of each block of 2x2 pixels, in layers.
+LAYER_SHIFTS = ((-0.375, 0.125), (0.375, -0.125))
 # Net 1's further outputs for each depth layer of a refined stack: changes of three amplitudes.
 REFINED = 3
 REFINED_SHARE = 0.3
 
 
 def inside_layers(depth: Tensor, count: int) -> Tensor:
-    """Which points of depth [N, H, W] lie in each of `count` layers, bool [N, count, H, W]."""
-    layer = layer_numbers(depth, count)
+    """Which points of depth [N, H, W] are placed in each of `count` layers, bool [N, count, H, W].
+
+    The four pixels of a block are moved by fractions of a layer before they are placed, so that blocks near the border
+    of two layers are shared by both: on a slanted plane sharpness goes over from one to the next.
+    """
+    height, width = depth.shape[-2:]
+    shift = depth.new_tensor(LAYER_SHIFTS).repeat(-(-height // 2), -(-width // 2))[:height, :width]
+    layer = (depth * count + shift).long().clamp(0, count - 1)
     return torch.stack([layer == k for k in range(count)], dim=1)
 
 

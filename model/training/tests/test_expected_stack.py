@@ -45,6 +45,16 @@ def test_a_white_scene_stays_white_across_a_step_in_depth_and_the_pupil_sets_the
     assert width[1] > 1.5 * width[0] > 0
 
 
+def test_what_lies_near_the_border_of_two_layers_is_shared_by_both() -> None:
+    depth = torch.tensor([3.0, 3.2, 3.5, 3.8]).repeat_interleave(2).expand(1, 2, 8) / COUNT
+    cover = layer_cover(depth, COUNT, 2)[0, :, 0]
+    torch.testing.assert_close(cover[2:5], torch.tensor([[0.5, 0.25, 0, 0], [0.5, 0.75, 1, 0.75], [0, 0, 0, 0.25]]))
+    assert cover.sum() == 4
+    # Beyond the volume's ends there is no layer to share with.
+    ends = layer_cover(torch.tensor([0.0, 1.0]).repeat_interleave(2).expand(1, 2, 4), COUNT, 2)[0, :, 0]
+    assert (ends[0, 0], ends[-1, 1], ends.sum()) == (1, 1, 2)
+
+
 def test_the_stack_is_near_what_composes_far_to_near_on_the_full_grid() -> None:
     """Of a slanted wall with blotches; a stack for another pupil is much farther."""
     amplitude = F.interpolate(smooth(6, 1), size=(96, 96), mode="nearest")

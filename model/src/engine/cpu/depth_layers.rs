@@ -8,6 +8,7 @@ use super::column_blocks::ColumnBlocks;
 use super::frame_blocks::{DEPTH, FrameBlocks};
 use super::view::View;
 use crate::RgbdFrame;
+use crate::engine::constants::LAYER_SHIFTS;
 use crate::simd::{InstructionSet, Simd, Task};
 use crate::weights::MOST_DEPTH_LAYERS;
 
@@ -47,7 +48,7 @@ impl DepthLayers {
     }
 }
 
-/// The layers of the pixels behind a block of columns.
+/// The layers of the pixels behind a block of columns, [pixel, row, column].
 struct Place<'a> {
     depths: &'a [f32],
     count: usize,
@@ -59,11 +60,15 @@ impl Task for Place<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         let Self { depths, count, layers, present } = self;
-        for (layer, depth) in layers.iter_mut().zip(depths) {
-            // What lies outside, or is no number, goes to an end.
-            let number = (depth * count as f32).max(0.0).min((count - 1) as f32) as i32;
-            *layer = number as f32;
-            *present |= 1 << number;
+        let plane_len = layers.len() / PIXELS_PER_SAMPLE;
+        let pixels = layers.chunks_exact_mut(plane_len).zip(depths.chunks_exact(plane_len));
+        for ((layers, depths), shift) in pixels.zip(LAYER_SHIFTS) {
+            for (layer, depth) in layers.iter_mut().zip(depths) {
+                // What lies outside, or is no number, goes to an end.
+                let number = (depth * count as f32 + shift).max(0.0).min((count - 1) as f32) as i32;
+                *layer = number as f32;
+                *present |= 1 << number;
+            }
         }
     }
 }

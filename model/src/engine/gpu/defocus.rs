@@ -9,7 +9,7 @@ use super::map::{GROUP, Map};
 use super::plan::{BufferId, Constant, Plan};
 use super::shared::Shared;
 use crate::engine::Precision;
-use crate::engine::constants::{LEAST_COVER, PAIRS};
+use crate::engine::constants::{LAYER_SHIFTS, LEAST_COVER, PAIRS};
 use crate::engine::disc::DiscTable;
 use crate::weights::{CONDITIONS, NetworkConfig};
 
@@ -64,7 +64,8 @@ pub(super) fn expect(
             ("ENTRIES_PER_MM", (disc.entries_per_mm as f32).into()),
         ])
         .collect();
-    let declared = inputs.declaration("input");
+    let [a, b, c, d] = LAYER_SHIFTS;
+    let declared = format!("{}const LAYER_SHIFTS = vec4f({a:?}, {b:?}, {c:?}, {d:?});\n", inputs.declaration("input"));
     let features = include_str!("input_features.wgsl");
     let files = [&declared, include_str!("blocks.wgsl"), features, include_str!("defocus.wgsl")];
     let shader = |lines: &Lines, entry| lines.shader(&format!("defocus: {entry}"), &constants, &files, entry);

@@ -1,8 +1,8 @@
 // What an eye should see at each depth layer, as defocus.rs computes it: every layer's light is blurred by its disc of
 // confusion at the focus on each other one, and the sum is divided by that of a white scene.
 //
-// Before this file: fft.wgsl, blocks.wgsl, input_features.wgsl, the constants of defocus.rs, and what the nets' map
-// declares as `input`.
+// Before this file: fft.wgsl, blocks.wgsl, input_features.wgsl, the constants of defocus.rs, among them LAYER_SHIFTS,
+// and what the nets' map declares as `input`.
 
 @group(0) @binding(1) var<storage, read> frame: array<f32>; // [4, frame height, frame width]
 @group(0) @binding(2) var<storage, read> pupil: Pupil;
@@ -16,8 +16,17 @@
 // The first of the map's groups, from those of the stack on, that hold nothing of it.
 const TOLD_GROUP = (3u * LAYERS + 3u) / 4u;
 
-fn depth_layer(depth: f32) -> u32 {
-    let layer = depth * f32(LAYERS);
+// The layers of a block's corners, a byte each.
+fn depth_layers(depths: vec4f) -> u32 {
+    var layers = 0u;
+    for (var corner = 0u; corner < BLOCK; corner++) {
+        layers |= depth_layer(depths[corner], LAYER_SHIFTS[corner]) << (8u * corner);
+    }
+    return layers;
+}
+
+fn depth_layer(depth: f32, shift: f32) -> u32 {
+    let layer = depth * f32(LAYERS) + shift;
     return u32(min(select(0f, layer, layer > 0f), f32(LAYERS - 1u)));
 }
 
@@ -51,9 +60,7 @@ fn take_layers(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
             let depths = corners(3u, x, y);
             inputs[input_place(3u, x, y)] = input_vector(2f * (depths - 0.5f));
             inputs[input_place(4u, x, y)] = input_vector((depths - 0.5f) * (3f + 2f * pupil.blur));
-            for (var corner = 0u; corner < BLOCK; corner++) {
-                layers[item] |= depth_layer(depths[corner]) << (8u * corner);
-            }
+            layers[item] = depth_layers(depths);
             layer_of[y * WIDTH + x] = layers[item];
             for (var colour = 0u; colour < 3u; colour++) {
                 let amplitudes = corners(colour, x, y);
