@@ -56,6 +56,18 @@ pub(crate) enum MatrixUnits {
 
 #[cfg(feature = "gpu")]
 impl MatrixUnits {
+    /// Whether the driver chooses between subgroups of 32 and 64 threads.
+    pub(crate) fn of_any_subgroups(self) -> bool {
+        match self {
+            Self::Device => false,
+            Self::DeviceOfAnySubgroups => true,
+            #[cfg(test)]
+            Self::Threads => false,
+            #[cfg(test)]
+            Self::ThreadsOfAnySubgroups { .. } => true,
+        }
+    }
+
     /// Whether networks have run with them on a card, so that an engine may take them unasked.
     pub(crate) fn have_run(self) -> bool {
         self != Self::DeviceOfAnySubgroups

@@ -302,7 +302,7 @@ def _intervals(numbers: dict[str, list[float]]) -> dict[str, list[float]]:
 
 def judge_scenes(shards: list[Shard], methods: list[Method], bench: Bench, after_alone: bool = False) -> Judged:
     """Every method at every pupil, and for ours the matrix PSNR(given, judged); one scene in memory at a time. With
-    `after_alone` neither fields before double phase nor the two references that are no holograms, in a quarter of the
+    `after_alone` neither fields before double phase nor the two references that are no holograms, in a third of the
     time. Raises ShardError and JudgementError for scenes and pictures with values that are no numbers."""
     pupils = shards[0].pupils_mm
     stages = (AFTER,) if after_alone else (BEFORE, AFTER)

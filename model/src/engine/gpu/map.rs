@@ -1,6 +1,5 @@
 //! Feature maps on the GPU.
 
-use super::matrix;
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan};
 use crate::engine::Precision;
 use crate::gpu::MatrixUnits;
@@ -38,7 +37,7 @@ impl Format {
     /// precision, but where bytes are what counts.
     pub(crate) fn of_outputs(self) -> Self {
         match self {
-            Self::HalfTiles(units) if matrix::of_any_subgroups(units) => Self::Half,
+            Self::HalfTiles(units) if units.of_any_subgroups() => Self::Half,
             Self::HalfTiles(_) => Self::Single,
             _ => self,
         }

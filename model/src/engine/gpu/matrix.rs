@@ -60,24 +60,12 @@ pub(super) fn rows(units: MatrixUnits) -> usize {
 /// Whether a plain layer makes half of the products, as [`winograd`](super::winograd) does. Cards of RDNA 3 do so: their
 /// units take longer for all of the products than their memory for the maps.
 pub(super) fn by_points(units: MatrixUnits) -> bool {
-    of_any_subgroups(units)
+    units.of_any_subgroups()
 }
 
 /// Whether the inputs of each output lie together. Cards of RDNA 3 hold them in one thread, and read them at once.
 fn weights_by_output(units: MatrixUnits) -> bool {
-    of_any_subgroups(units)
-}
-
-/// Whether the driver chooses between subgroups of 32 and 64 threads.
-pub(super) fn of_any_subgroups(units: MatrixUnits) -> bool {
-    match units {
-        MatrixUnits::Device => false,
-        MatrixUnits::DeviceOfAnySubgroups => true,
-        #[cfg(test)]
-        MatrixUnits::Threads => false,
-        #[cfg(test)]
-        MatrixUnits::ThreadsOfAnySubgroups { .. } => true,
-    }
+    units.of_any_subgroups()
 }
 
 /// A shader that multiplies on `units` the pixels that lie in `memory`, for workgroups of `rows`.
@@ -99,7 +87,7 @@ pub(super) fn source(output: &Map, units: MatrixUnits, memory: &str, rows: usize
             ("", include_str!("matrix_threads.wgsl"), how)
         }
     };
-    let threads = if of_any_subgroups(units) { 64 } else { 32 };
+    let threads = if units.of_any_subgroups() { 64 } else { 32 };
     let mut constants =
         format!("const THREADS = {threads}u;\nconst WEIGHTS_BY_OUTPUT = {};\n", weights_by_output(units));
     let store = match output.format {
