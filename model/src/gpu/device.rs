@@ -43,7 +43,7 @@ impl Gpu {
     /// # Errors
     /// There is none, or the driver of the best one refuses, and those of all others.
     pub fn open(choice: GpuChoice<'_>) -> Result<Self, GpuError> {
-        first_that_opens(&Self::candidates(choice)?, |adapter| Self::on(adapter, false))
+        first_that_opens(&Self::candidates(choice)?, |adapter| Self::on(adapter, |_| false))
     }
 
     /// The devices that will do, of which there is one at least, the best first: cards of their own before those that
@@ -87,15 +87,15 @@ impl Gpu {
         Ok(usable)
     }
 
-    /// Opens a device. Its matrix units can be used where that is asked for.
+    /// Opens a device. Its matrix units can be used if they are `wanted`.
     ///
     /// # Errors
     /// Its driver refuses.
-    pub(crate) fn on(adapter: &wgpu::Adapter, with_matrices: bool) -> Result<Self, GpuError> {
+    pub(crate) fn on(adapter: &wgpu::Adapter, wanted: impl Fn(MatrixUnits) -> bool) -> Result<Self, GpuError> {
         let wgpu::AdapterInfo { name, vendor, .. } = adapter.get_info();
         let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let half_precision = adapter.features() & wgpu::Features::SHADER_F16;
-        let matrix_units = with_matrices.then(|| matrix_units(adapter)).flatten();
+        let matrix_units = matrix_units(adapter).filter(|&units| wanted(units));
         let (matrices, experimental_features) = match matrix_units {
             // SAFETY: no other experimental feature is asked for, and this one is used by this crate's own shaders
             // alone, whose results are compared with the reference's on cards that have it: NVIDIA's, so far.
@@ -390,7 +390,7 @@ pub(crate) mod tests {
         let adapters = test_adapters();
         let candidates = Gpu::candidates(adapters.into());
         candidates
-            .and_then(|candidates| first_that_opens(&candidates, |adapter| Gpu::on(adapter, true)))
+            .and_then(|candidates| first_that_opens(&candidates, |adapter| Gpu::on(adapter, |_| true)))
             .unwrap_or_else(|error| panic!("{adapters:?} for tests: {error}"))
     }
 

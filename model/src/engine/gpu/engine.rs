@@ -81,12 +81,20 @@ impl GpuEngine {
         precision: Option<Precision>,
     ) -> Result<Self, EngineError> {
         first_that_opens(&Gpu::candidates(choice)?, |adapter| {
-            let open = |matrices| Self::on(Gpu::on(adapter, matrices)?, weights, bench, tables, precision);
-            if precision.is_some() {
-                return open(precision == Some(Precision::Half));
+            let open = |wanted: &dyn Fn(MatrixUnits) -> bool| {
+                Self::on(Gpu::on(adapter, wanted)?, weights, bench, tables, precision)
+            };
+            let channels = weights.config().channels;
+            match precision {
+                Some(Precision::Single) => open(&|_| false),
+                Some(Precision::Half) => open(&|units| units.suit(channels)),
+                None => {
+                    let known = |units: MatrixUnits| units.have_run() && units.suit(channels);
+                    let (engine, refused_matrices) =
+                        without_matrices_if_need_be(|matrices| open(&|units| matrices && known(units)))?;
+                    Ok(Self { refused_matrices, ..engine })
+                }
             }
-            let (engine, refused_matrices) = without_matrices_if_need_be(open)?;
-            Ok(Self { refused_matrices, ..engine })
         })
     }
 
@@ -99,12 +107,11 @@ impl GpuEngine {
     ) -> Result<Self, EngineError> {
         let precision = match precision {
             Some(precision) if gpu.half_precision => precision,
-            None if gpu.matrix_units.is_some_and(MatrixUnits::have_run) => Precision::Half,
+            None if gpu.matrix_units.is_some() => Precision::Half,
             _ => Precision::Single,
         };
-        let matrix_units = gpu.matrix_units.filter(|units| units.suit(weights.config().channels));
         let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
-        let format = Format::of(precision, matrix_units);
+        let format = Format::of(precision, gpu.matrix_units);
         let features = Features { format, method: Method::of_vendor(gpu.vendor) };
         let mut network = NetworkPlan::new(weights, bench, tables, features, limits)?;
         let plan = &network.plan;
