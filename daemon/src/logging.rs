@@ -18,7 +18,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use serde::Serialize;
 use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 
@@ -112,12 +112,11 @@ const DEFAULT: &str = "info";
 
 /// The filter that `HOLOD_LOG` asks for: a level, or directives such as `holod_daemon=debug`, separated by commas, over
 /// the usual `info`. With what is wrong with it, which is then left out.
-pub fn filter(asked: Option<&str>) -> (EnvFilter, Option<String>) {
+pub fn filter(asked: Option<&str>) -> (Targets, Option<String>) {
     let (mut directives, mut wrong) = (Vec::new(), Vec::new());
     for directive in asked.unwrap_or_default().split(',').map(str::trim).filter(|directive| !directive.is_empty()) {
         let level = directive.rsplit_once('=').map_or(directive, |(_, level)| level).to_lowercase();
-        let is_right =
-            LEVELS.contains(&level.as_str()) && directive.parse::<tracing_subscriber::filter::Directive>().is_ok();
+        let is_right = LEVELS.contains(&level.as_str()) && directive.parse::<Targets>().is_ok();
         if is_right { directives.push(directive) } else { wrong.push(directive) }
     }
     // A directive for a part of the program leaves the rest as it is.
@@ -131,7 +130,7 @@ pub fn filter(asked: Option<&str>) -> (EnvFilter, Option<String>) {
             LEVELS.join(", ")
         )
     });
-    (EnvFilter::new(directives.join(",")), complaint)
+    (directives.join(",").parse().expect("each directive is right"), complaint)
 }
 
 /// A line of the log.
@@ -312,6 +311,7 @@ pub fn recent_since(seen: &mut u64) -> Vec<Line> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use tracing_subscriber::Registry;
     use tracing_subscriber::filter::LevelFilter;
 
     /// The lines that are kept are those of the whole process.
@@ -361,12 +361,12 @@ mod tests {
 
     fn most(asked: &str) -> (Option<LevelFilter>, bool) {
         let (filter, complaint) = filter(Some(asked));
-        (filter.max_level_hint(), complaint.is_some())
+        (Layer::<Registry>::max_level_hint(&filter), complaint.is_some())
     }
 
     #[test]
     fn levels_and_directives_are_taken_and_a_typo_silences_nothing() {
-        assert_eq!(filter(None).0.max_level_hint(), Some(LevelFilter::INFO));
+        assert_eq!(most(""), (Some(LevelFilter::INFO), false));
         assert_eq!(most("debug"), (Some(LevelFilter::DEBUG), false));
         assert_eq!(most("WARN"), (Some(LevelFilter::WARN), false));
         assert_eq!(most("holod_daemon=trace"), (Some(LevelFilter::TRACE), false));
