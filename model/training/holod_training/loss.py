@@ -37,7 +37,8 @@ class LossWeights:
     `in_focus` is for a pupil of 2 mm on the default bench: what is in focus is a share of a stack that falls as the
     blur over the depth volume grows, so `for_bench` lets its weight grow in proportion, or by another power,
     `in_focus_growth`: with 2 wide pupils lose less of their sharpness. On benches of more diffraction than the default
-    one, which blurs what is in focus, too, it grows by the power `in_focus_diffraction_growth` of green's.
+    one, which blurs what is in focus, too, it grows by the power `in_focus_diffraction_growth` of green's, and that of
+    `outlines` by `outlines_diffraction_growth`.
     `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
     planes: `lpips` where a run has its weights, `structure` needs none. `outlines` is |∇P − ∇R|² where the scene is out
     of focus: what stands there of a mark is small in every other term. `black` is the light where there should be
@@ -56,6 +57,7 @@ class LossWeights:
     in_focus_diffraction_growth: float = 0.0
     focus_absolute: float = 0.0
     outlines: float = 0.0
+    outlines_diffraction_growth: float = 0.0
     black: float = 0.0
     light: float = 0.0
     foam: float = 0.0
@@ -67,8 +69,11 @@ class LossWeights:
         blur = min(optics.volume_blur_px(pupil_mm), MOST_IN_FOCUS_BLUR_PX) / IN_FOCUS_BLUR_PX
         (_, green, _), (_, of_default, _) = optics.volume_fresnel_px2, OpticsConfig().volume_fresnel_px2
         diffraction = max(1.0, green / of_default)
-        growth = blur**self.in_focus_growth * diffraction**self.in_focus_diffraction_growth
-        return replace(self, in_focus=self.in_focus * growth)
+        return replace(
+            self,
+            in_focus=self.in_focus * blur**self.in_focus_growth * diffraction**self.in_focus_diffraction_growth,
+            outlines=self.outlines * diffraction**self.outlines_diffraction_growth,
+        )
 
 
 def option_of(loss_key: str) -> str:

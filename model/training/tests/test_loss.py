@@ -176,6 +176,13 @@ def test_more_diffraction_than_the_default_benchs_weighs_the_in_focus_term_more_
     assert [at_equal_blur(growing, bench) for bench in (short, long)] == pytest.approx([7.0, 7.0 * 8.0])
 
 
+def test_more_diffraction_weighs_outlines_more_where_that_is_asked() -> None:
+    short, long = (dataclasses.replace(OpticsConfig(), eyepiece_focal_length_mm=mm) for mm in (20.0, 80.0))
+    plain, growing = LossWeights(outlines=5.0), LossWeights(outlines=5.0, outlines_diffraction_growth=0.5)
+    assert [plain.for_bench(bench, 3.0).outlines for bench in (short, long)] == pytest.approx([5.0, 5.0])
+    assert [growing.for_bench(bench, 3.0).outlines for bench in (short, long)] == pytest.approx([5.0, 10.0])
+
+
 def test_light_where_there_should_be_none_is_weighed_and_no_other() -> None:
     """What is seen of it is its light, not its square: a thousandth of white everywhere counts as a thousandth."""
     target = torch.zeros(2, 3, 64, 64)
