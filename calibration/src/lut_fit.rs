@@ -21,6 +21,10 @@ const TURN_SHARE: f64 = 0.2;
 const ONLY_TURN_SHARE: f64 = 0.05;
 /// A last turn, behind which the power goes back by less, counts where it leaves less than this share of the squares.
 const LAST_TURN_SHARE: f64 = 0.8;
+/// Powers that differ from a fringe's by more than this share of its height, rms, are none.
+const RESIDUAL_MAX: f64 = 0.15;
+/// No panel's phase goes farther, in multiples of π; a rig file takes no longer stroke.
+const STROKE_MAX_PI: f64 = 6.0;
 /// Rounds of fitting amplitude and curve in turn.
 const ROUNDS: usize = 8;
 /// Stiffnesses that are tried: powers of ten.
@@ -85,6 +89,15 @@ pub enum LutFitError {
          average more readings, or measure the laser's power beside them and divide"
     )]
     RunsBack { before: u16, after: u16 },
+    /// Powers of a meter that is too coarse, or of anything else.
+    #[error(
+        "the powers are those of no fringe: the nearest one has {stroke_pi:.3} π at the top level, expected {STROKE_MAX_PI} at \
+         most, and misses them by {percent:.0} % of its height (rms), expected {most:.0} at most; look whether the meter \
+         resolves a hundredth of the fringe, and average more readings",
+        percent = 1e2 * residual,
+        most = 1e2 * RESIDUAL_MAX
+    )]
+    NoFringe { stroke_pi: f64, residual: f64 },
 }
 
 /// Reads the phase of each level of a panel with `levels` of them back from a sweep, rows in the order of levels, the
@@ -108,12 +121,19 @@ pub fn fit(rows: &[LevelPower], levels: usize) -> Result<LutFit, LutFitError> {
     if let Some(place) = curve.runs_back() {
         return Err(LutFitError::RunsBack { before: rows[place].level, after: rows[place + 1].level });
     }
+    let residual = (curve.left / rows.len() as f64).sqrt() / curve.height;
+    let stroke_pi = curve.phases_rad[rows.len() - 1] / PI;
+    // Neither may be a number.
+    let is_fringe = stroke_pi <= STROKE_MAX_PI && (0.0..=RESIDUAL_MAX).contains(&residual);
+    if !is_fringe {
+        return Err(LutFitError::NoFringe { stroke_pi, residual });
+    }
     let phases_rad: Vec<f64> = (0..levels).map(|level| between(rows, &curve.phases_rad, level as u16)).collect();
     let turns = (1..).map(|turn| phases_rad.partition_point(|&phase_rad| phase_rad < f64::from(turn) * PI));
     Ok(LutFit {
         turns: turns.take_while(|&level| level < levels).map(|level| level as u16).collect(),
         phases_rad,
-        residual: (curve.left / rows.len() as f64).sqrt() / curve.height,
+        residual,
         background: curve.floor / curve.height,
     })
 }
@@ -433,8 +453,24 @@ mod tests {
 
     #[test]
     fn noise_alone_is_no_table() {
-        let mut random = Noise(3);
-        let rows: Vec<_> = (0..=255).map(|level| LevelPower { level, power: random.next() }).collect();
-        assert!(fit(&rows, 256).is_err() || fit(&rows, 256).unwrap().residual > 0.1);
+        for seed in 1..=20 {
+            let mut random = Noise(seed);
+            let rows: Vec<_> = (0..=255).map(|level| LevelPower { level, power: random.next() }).collect();
+            assert!(fit(&rows, 256).is_err(), "seed {seed}");
+        }
+    }
+
+    /// Through two powers a curve can be laid that is steep without end.
+    #[test]
+    fn powers_of_a_meter_too_coarse_are_no_table() {
+        let read_as = |step: f64| {
+            let power = |row: LevelPower| LevelPower { power: (row.power / step).round() * step, ..row };
+            fit(&swept(2.0, 1, 0.0, 7).into_iter().map(power).collect::<Vec<_>>(), 256)
+        };
+        assert!(matches!(read_as(4.0), Err(LutFitError::NoFringe { .. })), "{:?}", read_as(4.0));
+        assert!(off_by(&read_as(0.2).unwrap(), 2.0)[0] < 0.1);
+        let sine = |level: u16| (1.2 * (PI * f64::from(level) / 255.0).sin().powi(2)).round();
+        let rows: Vec<_> = (0..=255).map(|level| LevelPower { level, power: sine(level) }).collect();
+        assert!(matches!(fit(&rows, 256), Err(LutFitError::NoFringe { .. })), "{:?}", fit(&rows, 256));
     }
 }
