@@ -360,6 +360,16 @@ fn a_stall_timeout_may_be_left_to_the_frame_time() {
     let given = changed(&[("lit_ms = 3.0", "lit_ms = 3.0\nstall_timeout_ms = 80")]);
     assert_eq!(stall_timeout(&given), Some(TimeNs(80_000_000)));
     check("lit_ms = 3.0", "stall_timeout_ms = 2\nlit_ms = 3.0", "lasers.stall_timeout_ms", "", "a number from", "");
+    // Within a colour frame the frame that is shown grows old.
+    let short = "stall_timeout_ms = 12\nlit_ms = 3.0";
+    check(
+        "lit_ms = 3.0",
+        short,
+        "lasers.stall_timeout_ms",
+        "12 ms",
+        "at least one colour frame, 16.667 ms",
+        "lengthen",
+    );
 }
 
 #[test]
@@ -870,6 +880,25 @@ fn keys_of_another_laser_driver_and_keys_that_lack_are_named() {
         let fault = fault.unwrap_or_else(|| panic!("{lines}: {error}"));
         assert!(fault.line.is_some() && fault.advice.contains(words), "{fault}");
     }
+}
+
+#[test]
+fn one_port_of_two_names_is_one_port() {
+    let folder = tempfile::tempdir().unwrap();
+    let [port, other, alias] = ["port", "other", "alias"].map(|name| folder.path().join(name));
+    std::fs::write(&port, "").unwrap();
+    std::fs::write(&other, "").unwrap();
+    std::os::unix::fs::symlink(&port, &alias).unwrap();
+    let faults = |red: &Path, blue: &Path| {
+        let lines = format!(
+            "driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ red = {red:?}, blue = {blue:?} }}\n{ACCEPTED}"
+        );
+        with_driver(&lines).err().map_or(Vec::new(), |error| error.faults)
+    };
+    let keys = |faults: Vec<Fault>| faults.into_iter().map(|fault| fault.key).collect::<Vec<_>>();
+    let (apart, one) = (keys(faults(&port, &other)), keys(faults(&port, &alias)));
+    assert!(!apart.contains(&"lasers.devices.blue".into()), "{apart:?}");
+    assert!(one.contains(&"lasers.devices.blue".into()), "{one:?}");
 }
 
 #[test]
@@ -1503,6 +1532,12 @@ fn a_key_that_is_gone_is_told_with_what_to_do() {
         "one of network, weights_file, gpu",
         "remove it: networks compute with the rig's own optics",
     );
+}
+
+#[test]
+fn a_name_that_would_command_a_terminal_is_refused() {
+    let name = Rig::BUILT_IN_TOML.lines().find(|line| line.starts_with("name = ")).unwrap();
+    check(name, r#"name = "\u001b[2Jbench""#, "name", r"the control character '\u{1b}'", "a name for", "take that out");
 }
 
 #[test]

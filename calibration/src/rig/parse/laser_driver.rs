@@ -86,9 +86,11 @@ pub(super) fn read_driver(lasers: &Section<'_>, folder: &Path, provenance: &mut 
             if !lasers.has("profile_file") {
                 missing("profile", "how the lasers are spoken to", "profile = \"cobolt\", or profile_file");
             }
+            // A port may have two names, such as one that a udev rule gives it.
+            let port = |path: &str| std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
             for (index, colour) in Colour::ALL.into_iter().enumerate() {
                 let Some(path) = &devices[colour] else { continue };
-                if devices.0[..index].iter().flatten().any(|other| other.value == path.value) {
+                if devices.0[..index].iter().flatten().any(|other| port(other.value) == port(path.value)) {
                     let advice = "give each laser its own port";
                     path.fault("a port named twice", "one laser to a port", advice);
                 }

@@ -64,6 +64,9 @@ pub(super) fn read_lasers(
     if let (Some(timing), Some(heartbeat_ms)) = (timing, &heartbeat_ms) {
         check_heartbeat(timing, heartbeat_ms);
     }
+    if let (Some(timing), Some(stall_ms)) = (timing, &stall_ms) {
+        check_stall(timing, stall_ms);
+    }
     let driver = driver?;
     let power_of = |colour: Colour| match &power_mw[colour] {
         Some(power) => Some(power.value),
@@ -154,6 +157,15 @@ fn check_heartbeat(timing: FieldTiming, heartbeat_ms: &Found<'_, f64>) {
         let advice = "lengthen it, or the box goes dark between two frames";
         let found = format!("{} ms", heartbeat_ms.value);
         heartbeat_ms.fault(&found, &expected, advice);
+    }
+}
+
+fn check_stall(timing: FieldTiming, stall_ms: &Found<'_, f64>) {
+    let least_ms = timing.colour_frame_ms();
+    if stall_ms.value < least_ms {
+        let expected = format!("at least one colour frame, {} ms", shown(least_ms));
+        let advice = "lengthen it, or the last colour of each frame stays dark";
+        stall_ms.fault(format!("{} ms", stall_ms.value), &expected, advice);
     }
 }
 

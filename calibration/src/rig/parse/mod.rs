@@ -29,6 +29,8 @@ use super::profile::PanelProfile;
 use super::{LaserDriver, Panel, Provenance, Rig, RigError, SpecReader};
 use crate::toml_reader::{self, Section};
 
+const NAME: &str = "a name for logs and reports";
+
 /// Every key of a rig file, by table.
 const LAYOUT: [(&str, &[&str]); 6] = [
     ("", &["name", "panel", "optics", "lasers", "tracker", "model"]),
@@ -125,8 +127,13 @@ pub(super) fn laser_driver(text: &str, origin: &Path) -> Option<LaserDriver> {
 
 fn read_rig(root: &Section<'_>, text: &str, origin: &Path, read_spec: SpecReader<'_>) -> Option<Rig> {
     root.check_layout(&LAYOUT, &RETIRED);
-    let name = match root.text("name", "a name for logs and reports") {
-        Some(name) => name.value.to_owned(),
+    let name = match root.text("name", NAME) {
+        Some(name) => {
+            if let Some(control) = name.value.chars().find(|character| character.is_control()) {
+                name.fault(format!("a text with the control character {control:?}"), NAME, "take that out");
+            }
+            name.value.to_owned()
+        }
         None => origin.file_stem().map_or_else(|| "rig".into(), |stem| stem.to_string_lossy().into_owned()),
     };
     // A file that says nothing of the bench is of the built-in one: all of it, since its parts belong together.
