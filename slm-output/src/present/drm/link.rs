@@ -126,6 +126,12 @@ impl Link {
         let hotplug = self.checks.pop();
         (self.seen, self.pipe, self.mode, self.buffer_property) = (seen, ready.pipe, ready.mode, ready.buffer_property);
         (self.link_status, self.monitor) = (ready.link_status, ready.monitor);
+        // What was there before holod came is known of the rest; what another connector had is put back, too.
+        for change in ready.changes {
+            if !self.changes.iter().any(|known| known.is_of_the_same(&change)) {
+                self.changes.push(change);
+            }
+        }
         self.checks = ready.checks;
         self.checks.extend(hotplug);
         Ok(())
@@ -334,7 +340,7 @@ impl Ready {
         let link_status = LinkStatus::of(&before.connector);
         let monitor = Monitor::of(card, &before.connector);
         let mut ready = Self { pipe, mode, buffer_property, link_status, monitor, changes, checks: Vec::new() };
-        ready.checks = ready.read_back(card, seen, wanted)?;
+        ready.checks = ready.read_back(card, seen, wanted).inspect_err(|_| settings::restore(card, &ready.changes))?;
         let wrong: Vec<_> = ready.checks.iter().filter(|check| check.verdict == Verdict::Wrong).cloned().collect();
         if !wrong.is_empty() {
             settings::restore(card, &ready.changes);

@@ -113,6 +113,13 @@ pub(crate) struct Change {
     old_table: Option<Vec<u8>>,
 }
 
+impl Change {
+    /// Whether both are of one property of one object.
+    pub(crate) fn is_of_the_same(&self, other: &Self) -> bool {
+        (self.object, self.property) == (other.object, other.property)
+    }
+}
+
 fn object(pipe: &Pipe, on: On) -> RawResourceHandle {
     match on {
         On::Connector => pipe.connector.into(),
