@@ -51,6 +51,8 @@ const LIMITS: Limits = Limits {
 };
 /// Optical power of each laser at full PWM, microwatts at the panel.
 const FULL_POWER_UW: [u32; 3] = [1000; 3];
+/// Of the PWM, at 125 MHz: a power is rounded down to one of these.
+const POWER_STEPS: u16 = 1024;
 /// A loop that stands still for this long resets the board, which makes it dark.
 const WATCHDOG_MS: u32 = 20;
 
@@ -113,11 +115,11 @@ impl<R: SetDutyCycle, G: SetDutyCycle, B: SetDutyCycle> Hardware for Board<'_, R
     fn set_power(&mut self, power_uw: [u32; 3]) {
         let duty = |laser: Laser| {
             let full = u64::from(FULL_POWER_UW[laser.index()].max(1));
-            (u64::from(power_uw[laser.index()]) * 1000 / full).min(1000) as u16
+            (u64::from(power_uw[laser.index()]) * u64::from(POWER_STEPS) / full).min(u64::from(POWER_STEPS)) as u16
         };
-        let _never_fails = self.powers.0.set_duty_cycle_fraction(duty(Laser::Red), 1000);
-        let _never_fails = self.powers.1.set_duty_cycle_fraction(duty(Laser::Green), 1000);
-        let _never_fails = self.powers.2.set_duty_cycle_fraction(duty(Laser::Blue), 1000);
+        let _never_fails = self.powers.0.set_duty_cycle(duty(Laser::Red));
+        let _never_fails = self.powers.1.set_duty_cycle(duty(Laser::Green));
+        let _never_fails = self.powers.2.set_duty_cycle(duty(Laser::Blue));
     }
 
     fn feed_watchdog(&mut self) {
@@ -151,10 +153,9 @@ fn main() -> ! {
 
     let slices = Slices::new(peripherals.PWM, &mut peripherals.RESETS);
     let (mut red, mut green, mut blue) = (slices.pwm3, slices.pwm4, slices.pwm5);
-    // 125 MHz in 1024 steps.
-    red.set_top(1023);
-    green.set_top(1023);
-    blue.set_top(1023);
+    red.set_top(POWER_STEPS - 1);
+    green.set_top(POWER_STEPS - 1);
+    blue.set_top(POWER_STEPS - 1);
     red.enable();
     green.enable();
     blue.enable();
