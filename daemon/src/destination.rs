@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::special_file;
@@ -57,6 +58,36 @@ impl Destination {
         matches!(self, Self::Stdout)
     }
 
+    /// Refuses a report in JSON beside results on standard output.
+    ///
+    /// # Errors
+    /// Both would be written there.
+    pub(crate) fn refuse_json(&self, option: &str, json: bool) -> Result<(), Failure> {
+        if !(json && self.is_stdout()) {
+            return Ok(());
+        }
+        let says = format!("{option} - and --json would both write to standard output: give one of them");
+        Err(Failure::new(Exit::Usage, says))
+    }
+
+    /// Refuses to take the place of one of the `inputs`, by whatever name: what the command reads would be lost.
+    ///
+    /// # Errors
+    /// It is one of them.
+    pub(crate) fn refuse_inputs(&self, option: &str, inputs: impl IntoIterator<Item = PathBuf>) -> Result<(), Failure> {
+        let Self::File(path) = self else { return Ok(()) };
+        let place = |path: &Path| path.metadata().ok().map(|found| (found.dev(), found.ino()));
+        let Some(own) = place(path) else { return Ok(()) };
+        match inputs.into_iter().find(|input| place(input) == Some(own)) {
+            Some(input) => {
+                let (path, input) = (path.display(), input.display());
+                let says = format!("{option} {path}: this command reads {input}, which that is; name another file");
+                Err(Failure::new(Exit::Usage, says))
+            }
+            None => Ok(()),
+        }
+    }
+
     /// Lets `write` write the file.
     ///
     /// # Errors
@@ -104,6 +135,24 @@ mod tests {
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "third");
         assert!(Destination::new(folder.path(), "--out", true).is_err(), "a directory is no file");
         assert!(Destination::new(Path::new("-"), "--out", false).unwrap().is_stdout());
+    }
+
+    #[test]
+    fn what_is_read_is_not_overwritten_even_by_force() {
+        let folder = tempfile::tempdir().unwrap();
+        let [log, other, alias] = ["log.csv", "other.csv", "alias.csv"].map(|name| folder.path().join(name));
+        std::fs::write(&log, "1").unwrap();
+        std::fs::write(&other, "2").unwrap();
+        std::os::unix::fs::symlink(&log, &alias).unwrap();
+        let refused = |out: &Path| Destination::new(out, "--out", true).unwrap().refuse_inputs("--out", [log.clone()]);
+        for out in [&log, &alias] {
+            let refused = refused(out).unwrap_err();
+            assert_eq!(refused.exit, Exit::Usage);
+            assert!(refused.to_string().contains("this command reads"), "{refused}");
+        }
+        refused(&other).unwrap();
+        refused(&folder.path().join("new.csv")).unwrap();
+        refused(Path::new("-")).unwrap();
     }
 
     #[test]

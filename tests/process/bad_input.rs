@@ -284,8 +284,11 @@ fn a_dash_writes_to_standard_output() {
     assert!(lines.contains("P1,0,0,L,3.5"), "{lines}");
     let svg = String::from_utf8(to_stdout(&["log", "info", "log.csv", "--plot", "-"])).unwrap();
     assert!(svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"), "{svg}");
-    let both = run(HOLOD, &[&picture[..], &["--json"]].concat(), folder.path());
-    assert_eq!(both.status.code(), Some(64));
+    for command in [&picture[..], &["report", "--out", "-"], &["lut", "log.csv", "--out", "-"]] {
+        let both = run(HOLOD, &[command, &["--json"]].concat(), folder.path());
+        assert_eq!(both.status.code(), Some(64), "{command:?}");
+        assert!(both.stderr.contains("would both write to standard output"), "{command:?}: {}", both.stderr);
+    }
     assert_eq!(listing(folder.path()).len(), 2, "nothing is left behind");
 }
 
@@ -322,6 +325,35 @@ fn a_signal_takes_away_what_waits_for_a_slow_reader() {
     rustix::process::kill_process(holods_number, Signal::INT).unwrap();
     assert_eq!(holod.wait().unwrap().code(), Some(130));
     assert_eq!(listing(&temporary), []);
+}
+
+#[test]
+fn no_command_overwrites_what_it_reads() {
+    let folder = holod_tests::new_folder();
+    let at = |name: &str| folder.path().join(name);
+    fs::write(at("log.csv"), "time_s,diameter_mm\n0,3\n0.01,3\n").unwrap();
+    fs::write(at("powers.csv"), "level,power\n0,1\n").unwrap();
+    image::RgbImage::new(64, 64).save(at("colour.png")).unwrap();
+    image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(64, 64, image::Luma([500])).save(at("depth.png")).unwrap();
+    fs::write(at("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let view = ["view", "--scene", "colour.png,depth.png", "--depth-encoding", "millimetres", "--config", "rig.toml"];
+    let view = [&view[..], &["--pupil", "3", "--focus", "1", "--out", "./colour.png"]].concat();
+    for (args, kept) in [
+        (&["log", "info", "log.csv", "--plot", "log.csv"][..], "log.csv"),
+        (&["log", "convert", "log.csv", "--to", "lines", "--out", "./log.csv"], "log.csv"),
+        (&["lut", "powers.csv", "--out", "powers.csv"], "powers.csv"),
+        (&view, "colour.png"),
+    ] {
+        let before = fs::read(at(kept)).unwrap();
+        let ended = run(HOLOD, &[args, &["--force"]].concat(), folder.path());
+        assert_eq!(ended.status.code(), Some(64), "{args:?}: {}", ended.stderr);
+        assert!(
+            ended.stderr.contains("this command reads") && ended.stderr.contains("another file"),
+            "{}",
+            ended.stderr
+        );
+        assert_eq!(fs::read(at(kept)).unwrap(), before, "{args:?}");
+    }
 }
 
 #[test]

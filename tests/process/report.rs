@@ -144,6 +144,9 @@ fn a_run_that_is_packed_and_sent_is_shown_again_to_the_byte() {
     let again = bench.holod(&["report", "record", "--out", "report.tar.gz"]);
     assert_eq!(again.status.code(), Some(73), "{}", again.stderr);
     assert!(again.stderr.contains("--force"), "{}", again.stderr);
+    let over_itself = bench.holod(&["report", "record", "--out", "record/bench/rig.toml", "--force"]);
+    assert_eq!(over_itself.status.code(), Some(64), "{}", over_itself.stderr);
+    assert!(over_itself.stderr.contains("this command reads"), "{}", over_itself.stderr);
     bench.pack(&["--force"]);
 
     let home = bench.0.path().display().to_string();

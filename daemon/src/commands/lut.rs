@@ -9,6 +9,7 @@ use holod_calibration::lut_fit::{self, LevelPower, LutFit};
 use holod_calibration::rig::PhaseSign;
 use serde::Serialize;
 
+use super::service_facts::files_of;
 use crate::cli::LutArgs;
 use crate::destination::Destination;
 use crate::failure::{Exit, Failure};
@@ -37,7 +38,9 @@ struct Made {
 
 pub(super) fn lut(args: &LutArgs) -> Result<(), Failure> {
     let out = Destination::new(&args.out, "--out", args.force)?;
+    out.refuse_json("--out", args.json)?;
     let rig = setup::rig(&args.rig)?;
+    out.refuse_inputs("--out", files_of(&rig).into_iter().chain([args.powers.clone()]))?;
     let levels = 1usize << rig.panel.bit_depth;
     let rows = read(&args.powers)?;
     let fault = |why: &dyn fmt::Display| Failure::new(Exit::Data, format!("{}: {why}", args.powers.display()));

@@ -1,5 +1,7 @@
 //! `holod report`: packs what somebody else needs to see what happened here.
 
+use std::path::{Path, PathBuf};
+
 use crate::bug_report::{Contents, Scrubber, default_name};
 use crate::cli::ReportArgs;
 use crate::destination::Destination;
@@ -22,6 +24,8 @@ pub(super) fn report(args: &ReportArgs) -> Result<(), Failure> {
     };
     let path = args.out.clone().unwrap_or_else(|| default_name(&contents));
     let destination = Destination::new(&path, "--out", args.force)?;
+    destination.refuse_json("--out", args.json)?;
+    destination.refuse_inputs("--out", args.record.iter().flat_map(|record| contents_of(record)))?;
     let mut manifest = None;
     destination.write(|path| {
         let staging = Staging::of_file(path, args.force)?;
@@ -47,4 +51,10 @@ pub(super) fn report(args: &ReportArgs) -> Result<(), Failure> {
         Machine::text(&manifest.machine),
         path.display(),
     ))
+}
+
+/// The files of a record, those of its bench among them.
+fn contents_of(record: &Path) -> Vec<PathBuf> {
+    let files = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    files(record).chain(files(&record.join("bench"))).collect()
 }

@@ -13,12 +13,17 @@ use holod_slm_output::LevelsFrame;
 use serde::Serialize;
 
 use super::render::{self, Computed};
+use super::service_facts::files_of;
 use crate::cli::{Backend, SceneArgs, ViewArgs};
 use crate::destination::Destination;
 use crate::failure::{Exit, Failure, is_file};
 use crate::pictures::shown_pattern;
+use crate::source::scene;
 use crate::staging::folder_of;
 use crate::{progress, renderer, results, setup};
+
+/// What `holod render` wrote, in its folder.
+const HOLOGRAM: &str = "field.safetensors";
 
 #[derive(Serialize)]
 struct Report<'a> {
@@ -48,13 +53,10 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
         ));
     }
     let out = Destination::new(&args.out, "--out", args.force)?;
-    if out.is_stdout() && args.json {
-        return Err(Failure::new(
-            Exit::Usage,
-            "--out - and --json would both write to standard output: give one of them",
-        ));
-    }
+    out.refuse_json("--out", args.json)?;
     let rig = setup::rig_to_show(&args.rig, &args.network)?;
+    let hologram = args.hologram.iter().map(|folder| folder.join(HOLOGRAM));
+    out.refuse_inputs("--out", hologram.chain(scene::files(&args.scene, &rig.geometry)).chain(files_of(&rig)))?;
     let looked_at = match (&args.hologram, args.pupil) {
         (Some(folder), _) => {
             let hologram = load(folder)?;
@@ -108,7 +110,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
 }
 
 fn load(folder: &Path) -> Result<StoredHologram, Failure> {
-    let path = folder.join("field.safetensors");
+    let path = folder.join(HOLOGRAM);
     if is_file(folder)? {
         let what = format!(
             "--hologram {}: found a file, expected the folder that `holod render` wrote; name the folder, such as {}",
@@ -121,7 +123,7 @@ fn load(folder: &Path) -> Result<StoredHologram, Failure> {
         return Err(Failure::new(
             Exit::NoInput,
             format!(
-                "--hologram {}: there is no field.safetensors in it; make one with `holod render --out {}`",
+                "--hologram {}: there is no {HOLOGRAM} in it; make one with `holod render --out {}`",
                 folder.display(),
                 folder.display()
             ),

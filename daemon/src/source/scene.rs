@@ -1,5 +1,6 @@
 //! Scenes from files, read whole before they are shown.
 
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use holod_calibration::{DisplayGeometry, Resolution};
@@ -99,6 +100,13 @@ pub(super) fn judge(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<(), 
 pub fn first_frame(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
     let Some((spec, scene)) = open(args, geometry)? else { return sample_frames(args, geometry) };
     load(spec, &scene, 1, None, args, geometry)
+}
+
+/// The files of the scene that was named, as far as it can be opened.
+pub(crate) fn files(args: &SceneArgs, geometry: &DisplayGeometry) -> Vec<PathBuf> {
+    let Ok(Some((_, scene))) = open(args, geometry) else { return Vec::new() };
+    let pictures = (0..scene.frames()).flat_map(|index| scene.pictures(index));
+    pictures.chain(scene.file().map(Path::to_owned)).collect()
 }
 
 /// The scene that was named, with its name.

@@ -12,6 +12,7 @@ use crate::results;
 
 pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
     let out = Destination::new(&args.out, "--out", args.force)?;
+    out.refuse_inputs("--out", [args.log.clone()])?;
     if args.to == LogFormatArg::Csv && args.scale.is_some() {
         return Err(Failure::new(Exit::Usage, "--scale is for --to lines: CSV keeps the log's own unit"));
     }

@@ -15,7 +15,7 @@ use serde::Serialize;
 use super::{odd_scale, read};
 use crate::cli::LogInfoArgs;
 use crate::destination::Destination;
-use crate::failure::{Exit, Failure};
+use crate::failure::Failure;
 use crate::pictures::{PupilPlot, PupilSampleMark};
 use crate::results;
 use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
@@ -47,12 +47,9 @@ struct Judged {
 
 pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
     let plot = args.plot.as_deref().map(|path| Destination::new(path, "--plot", args.force)).transpose()?;
-    let plots_to_stdout = plot.as_ref().is_some_and(Destination::is_stdout);
-    if plots_to_stdout && args.json {
-        return Err(Failure::new(
-            Exit::Usage,
-            "--plot - and --json would both write to standard output: give one of them",
-        ));
+    if let Some(plot) = &plot {
+        plot.refuse_json("--plot", args.json)?;
+        plot.refuse_inputs("--plot", [args.log.clone()])?;
     }
     let recording = read(&args.log)?;
     if let Some(warning) = odd_scale(&args.log, &recording, args.scale) {
@@ -72,7 +69,7 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
         let drawn = PupilPlot { unit, of_log: true, samples, estimate, truth: &[] };
         plot.write(|path| drawn.save(path))?;
     }
-    if plots_to_stdout {
+    if plot.is_some_and(|plot| plot.is_stdout()) {
         return Ok(());
     }
     if args.json {
