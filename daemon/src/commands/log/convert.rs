@@ -26,6 +26,12 @@ pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
     if let Some(warning) = odd_scale(&args.log, &recording, args.scale) {
         tracing::warn!("{warning}");
     }
+    if let Some(scale) = recording.recorded_scale().filter(|scale| args.to == LogFormatArg::Csv && *scale != 1.0) {
+        tracing::warn!(
+            "the run had a scale of {scale} mm per unit, which CSV does not keep: give --scale {scale} wherever it is read, \
+             or write --to lines, which are in millimetres of the eye"
+        );
+    }
     let scale = args.scale.or(recording.recorded_scale());
     out.write(|path| {
         let written = match args.to {
