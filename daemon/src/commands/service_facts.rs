@@ -12,7 +12,14 @@ pub(super) const USUAL_RIG: &str = "/etc/holod/rig.toml";
 /// Where the unit lets holod write.
 pub(super) const STATE_FOLDER: &str = "/var/lib/holod";
 /// What the unit hides (`ProtectHome=`, `PrivateTmp=`).
-pub(super) const HIDDEN_FROM_SERVICE: [&str; 5] = ["/home", "/root", "/run/user", "/tmp", "/var/tmp"];
+const HIDDEN_FROM_SERVICE: [&str; 5] = ["/home", "/root", "/run/user", "/tmp", "/var/tmp"];
+
+/// The hidden folder that a file is in, by its name or by where links and `..` lead from there.
+pub(super) fn hidden_from_service(file: &Path) -> Option<&'static str> {
+    let leads_to = file.canonicalize().unwrap_or_else(|_| file.to_owned());
+    let is_in = |folder: &&str| file.starts_with(folder) || leads_to.starts_with(folder);
+    HIDDEN_FROM_SERVICE.into_iter().find(is_in)
+}
 
 /// An absolute path in a machine whose `/` is the folder `root`.
 pub(super) fn below(root: &Path, path: &Path) -> PathBuf {

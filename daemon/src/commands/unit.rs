@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fs;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_pupil_input::TrackerSpec;
@@ -12,7 +12,7 @@ use holod_slm_output::OutputSpec;
 use holod_slm_output::present::drm::DrmTarget;
 
 use super::run;
-use super::service_facts::{BINARY, HIDDEN_FROM_SERVICE, STATE_FOLDER, USUAL_RIG, below, files_of};
+use super::service_facts::{BINARY, STATE_FOLDER, USUAL_RIG, below, files_of, hidden_from_service};
 use crate::cli::{PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
 use crate::source::feed_socket;
@@ -43,6 +43,11 @@ pub(super) fn unit(args: &UnitArgs) -> Result<(), Failure> {
 /// The drop-in for a run with these options, which `words` are; `/dev`, `/proc` and `/sys` are looked at below `root`.
 pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -> Result<String, Failure> {
     let usage = |says: String| Failure::new(Exit::Usage, says);
+    if let Some(word) = words.iter().find(|word| word.contains(char::is_control)) {
+        return Err(usage(format!(
+            "found {word:?}, expected words without control characters, as a unit's file has them"
+        )));
+    }
     let config = run.rig.config.as_deref().ok_or_else(|| usage(format!("name the rig: --config {USUAL_RIG}")))?;
     visible_paths(rig, run).into_iter().try_for_each(|(what, path)| visible(what, &path))?;
     sockets(run).into_iter().try_for_each(|(what, socket)| makeable(what, &socket))?;
@@ -53,7 +58,8 @@ pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -
              --record-in {STATE_FOLDER}/NAME, in which each start has a folder of its own"
         )));
     }
-    if let Some(folder) = run.record_in.as_deref().filter(|folder| !folder.starts_with(STATE_FOLDER)) {
+    let is_below = |folder: &Path| folder.starts_with(STATE_FOLDER) && !goes_up(folder);
+    if let Some(folder) = run.record_in.as_deref().filter(|folder| !is_below(folder)) {
         let found = folder.display();
         return Err(usage(format!("--record-in {found}: the service may write below {STATE_FOLDER} only")));
     }
@@ -154,7 +160,7 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
     match run.output.parse().map_err(Failure::because(Exit::Usage))? {
         OutputSpec::Headless(_) => {}
         OutputSpec::Drm(target) => {
-            needs.devices.insert(card(&target, root));
+            needs.devices.insert(card(&target, root)?);
             needs.modules.extend(drivers("card", root));
         }
         OutputSpec::Window(_) => {
@@ -232,20 +238,13 @@ fn serial_class(port: &Path, what: &str, root: &Path) -> Result<Option<String>, 
     })
 }
 
-/// The card of a connector by a name that stays, or all of them where a monitor is named.
-fn card(target: &DrmTarget, root: &Path) -> String {
-    if let Some(card) = &target.card {
-        return stable_name(card, root);
-    }
-    let suffix = format!("-{}", target.connector);
-    let mut cards = names(&root.join("sys/class/drm"), "card").into_iter().filter_map(|name| {
-        let card = name.strip_suffix(&suffix)?;
-        card["card".len()..].bytes().all(|byte| byte.is_ascii_digit()).then(|| card.to_owned())
-    });
-    match (cards.next(), cards.next()) {
-        (Some(card), None) => stable_name(&Path::new("/dev/dri").join(card), root),
-        _ => "char-drm".to_owned(),
-    }
+/// The card of a connector by a name that stays.
+fn card(target: &DrmTarget, root: &Path) -> Result<String, Failure> {
+    let node = match &target.card {
+        Some(card) => card.clone(),
+        None => target.find(&root.join("sys/class/drm")).map_err(Failure::because(Exit::Unavailable))?.card,
+    };
+    Ok(stable_name(&node, root))
 }
 
 /// What a Vulkan driver opens: render nodes, and NVIDIA's own devices.
@@ -304,7 +303,7 @@ fn sockets(run: &RunArgs) -> Vec<(&'static str, PathBuf)> {
 /// Refuses a socket that the service cannot make.
 fn makeable(what: &str, socket: &Path) -> Result<(), Failure> {
     // Nothing makes a folder in the former.
-    if socket.parent() == Some(Path::new(SERVICE_FOLDER)) || socket.starts_with(STATE_FOLDER) {
+    if socket.parent() == Some(Path::new(SERVICE_FOLDER)) || (socket.starts_with(STATE_FOLDER) && !goes_up(socket)) {
         return Ok(());
     }
     let name = socket.file_name().unwrap_or_default().display();
@@ -351,12 +350,20 @@ fn visible(what: &str, path: &Path) -> Result<(), Failure> {
     if !path.is_absolute() {
         return refused(format!("{what}: found {shown}; the service starts in /, write the whole path"));
     }
-    match HIDDEN_FROM_SERVICE.into_iter().find(|folder| path.starts_with(folder)) {
+    match hidden_from_service(path) {
         Some(folder) => {
-            refused(format!("{what}: found {shown}; the service does not see {folder}, move it to /etc/holod or /srv"))
+            let leads = if path.starts_with(folder) { "" } else { ", which leads there" };
+            refused(format!(
+                "{what}: found {shown}{leads}; the service does not see {folder}, move it to /etc/holod or /srv"
+            ))
         }
         None => Ok(()),
     }
+}
+
+/// Whether a path is elsewhere than it begins.
+fn goes_up(path: &Path) -> bool {
+    path.components().any(|part| part == Component::ParentDir)
 }
 
 /// A word of `ExecStart=`, in which systemd reads quotes, backslashes, `$` and `%`.
@@ -455,9 +462,59 @@ mod tests {
         assert_eq!(allowed(&few.unwrap()), ["/dev/ttyS0", "char-ttyACM"]);
         let none = drop_in_of(&[&RIG[..], &["--backend", "cpu"]].concat(), &Rig::default(), root.path()).unwrap();
         assert!(allowed(&none).is_empty(), "{none}");
-        // A monitor's name may be at any card.
-        let named = drop_in_of(&[&RIG[..], &["--output", "drm:PLUTO-2.1"]].concat(), &rig(), root.path()).unwrap();
-        assert!(allowed(&named).contains(&"char-drm"), "{named}");
+    }
+
+    /// The base block of a monitor's EDID that has a name and nothing else.
+    fn edid(name: &str) -> [u8; 128] {
+        let mut block = [0; 128];
+        block[1..7].fill(0xff);
+        block[57] = 0xfc;
+        block[59..59 + name.len()].copy_from_slice(name.as_bytes());
+        block[59 + name.len()] = b'\n';
+        block[127] = block.iter().fold(0_u8, |sum, byte| sum.wrapping_sub(*byte));
+        block
+    }
+
+    #[test]
+    fn a_panel_is_at_a_card_or_its_name_is_refused() {
+        let root = machine();
+        fs::write(root.path().join("sys/class/drm/card1-DP-2/edid"), edid("PLUTO-2.1")).unwrap();
+        let with = |output: &str| drop_in_of(&[&RIG[..], &["--output", output]].concat(), &rig(), root.path());
+        let of_monitor = with("drm:PLUTO-2.1").unwrap();
+        assert!(allowed(&of_monitor).contains(&"/dev/dri/by-path/pci-0000:01:00.0-card"), "{of_monitor}");
+        for absent in ["drm:DP-9", "drm:DP1", "drm:PLUTO-3"] {
+            let refused = with(absent).unwrap_err();
+            assert!(refused.contains("no connector and no monitor is") && refused.contains("DP-2"), "{refused}");
+        }
+        fs::create_dir(root.path().join("sys/class/drm/card0-DP-2")).unwrap();
+        assert!(with("drm:DP-2").unwrap_err().contains("card=/dev/dri/card"));
+        assert!(allowed(&with("drm:DP-2,card=/dev/dri/card0").unwrap()).contains(&"/dev/dri/card0"));
+    }
+
+    #[test]
+    fn links_and_steps_up_do_not_hide_where_a_file_is() {
+        let root = machine();
+        let hidden = tempfile::tempdir_in("/tmp").unwrap();
+        let rig_file = hidden.path().join("rig.toml");
+        fs::write(&rig_file, "").unwrap();
+        // The tests' folder may be hidden, too.
+        let link = Path::new("/dev/shm").join(hidden.path().file_name().unwrap());
+        symlink(&rig_file, &link).unwrap();
+        let refused = |words: &[&str]| drop_in_of(words, &rig(), root.path()).unwrap_err();
+        let by_link = refused(&["--config", link.to_str().unwrap()]);
+        fs::remove_file(&link).unwrap();
+        assert!(by_link.contains("which leads there; the service does not see /tmp"), "{by_link}");
+        let up = refused(&[&RIG[..], &["--record-in", "/var/lib/holod/../runs"]].concat());
+        assert!(up.contains("/var/lib/holod only"), "{up}");
+        let socket = refused(&[&RIG[..], &["--page", "unix:/var/lib/holod/../x"]].concat());
+        assert!(socket.contains("may make sockets in"), "{socket}");
+    }
+
+    #[test]
+    fn a_line_break_is_no_part_of_a_unit() {
+        let root = machine();
+        let refused = drop_in_of(&[&RIG[..], &["--scene", "/srv/a\nExecStartPre=x"]].concat(), &rig(), root.path());
+        assert!(refused.unwrap_err().contains("without control characters"));
     }
 
     #[test]

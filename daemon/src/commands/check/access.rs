@@ -11,7 +11,7 @@ use rustix::fs::Access;
 use rustix::process::{Resource, getrlimit};
 
 use super::Check;
-use crate::commands::service_facts::{HIDDEN_FROM_SERVICE, files_of};
+use crate::commands::service_facts::{files_of, hidden_from_service};
 use crate::scheduling;
 
 const SERVICE_USER: &str = "holod";
@@ -98,8 +98,7 @@ fn files(rig: &Rig, runner: &Runner) -> Result<String, Vec<String>> {
     let mut faults = Vec::new();
     for file in &files {
         let shown = file.display();
-        let hidden = HIDDEN_FROM_SERVICE.into_iter().find(|folder| file.starts_with(folder));
-        match (runner, hidden) {
+        match (runner, hidden_from_service(file)) {
             (Runner::Service { .. }, Some(folder)) => {
                 faults.push(format!("{shown}: the service does not see {folder}: move it to /etc/holod or /srv"));
             }

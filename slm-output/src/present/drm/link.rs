@@ -13,12 +13,13 @@ use super::card::{Card, Pipe, ScanBuffer, flip};
 use super::check::{DisplayCheck, Verdict};
 use super::error::DrmError;
 use super::event::{Uevent, for_each_flip};
-use super::find::{NotFound, SYS_CLASS_DRM, SeenConnector, choose, seen_connectors};
+use super::find::{SYS_CLASS_DRM, SeenConnector, seen_connectors};
 use super::hotplug::Hotplug;
 use super::mode;
 use super::monitor::Monitor;
 use super::seat::Seat;
 use super::settings::{self, Change, LinkStatus};
+use super::target::DrmTarget;
 use super::timing::FlipStamp;
 
 /// On the screen, on its way there, being written, and one more: a driver may still read the last picture a while after
@@ -33,10 +34,7 @@ const READINGS: usize = 3;
 /// What is wanted of a connector.
 #[derive(Clone, Debug)]
 pub(crate) struct Wanted {
-    /// A connector's name, or a monitor's name or serial number.
-    pub(crate) asked: String,
-    /// The card that it must be on, if it matters.
-    pub(crate) card: Option<std::path::PathBuf>,
+    pub(crate) target: DrmTarget,
     pub(crate) size: Resolution,
     pub(crate) refresh_hz: f64,
     pub(crate) channel_bits: u8,
@@ -71,7 +69,7 @@ impl Link {
         seat: Option<&Seat>,
         write_flat: impl Fn(&mut ScanBuffer),
     ) -> Result<Self, DrmError> {
-        let seen = find(wanted, Path::new(SYS_CLASS_DRM))?;
+        let seen = wanted.target.find(Path::new(SYS_CLASS_DRM))?;
         let card = Card::open(&seen.card, seat)?;
         let format = format(wanted.channel_bits);
         let buffer = || ScanBuffer::new(&card, wanted.size, format);
@@ -117,7 +115,7 @@ impl Link {
         if !asked.map_err(self.card.refused("asking the monitor"))? {
             return Err(self.disconnected());
         }
-        let seen = find(wanted, Path::new(SYS_CLASS_DRM))?;
+        let seen = wanted.target.find(Path::new(SYS_CLASS_DRM))?;
         if seen.card != self.seen.card {
             return Err(self.disconnected());
         }
@@ -269,15 +267,6 @@ impl Flips {
 
 fn format(channel_bits: u8) -> DrmFourcc {
     if channel_bits == 10 { DrmFourcc::Xrgb2101010 } else { DrmFourcc::Xrgb8888 }
-}
-
-fn find(wanted: &Wanted, class: &Path) -> Result<SeenConnector, DrmError> {
-    let asked = wanted.asked.clone();
-    choose(seen_connectors(class), &asked, wanted.card.as_deref()).map_err(|found| match found {
-        NotFound::NoCard => DrmError::NoCard { class: SYS_CLASS_DRM },
-        NotFound::None(there) => DrmError::NoSuchConnector { asked, there },
-        NotFound::Several(there) => DrmError::Ambiguous { asked, there },
-    })
 }
 
 /// One descriptor that is readable when the card, the hotplug socket or the seat's bell is.

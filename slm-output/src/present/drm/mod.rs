@@ -26,6 +26,7 @@ mod seat;
 #[path = "no_seat.rs"]
 mod seat;
 mod settings;
+mod target;
 mod timing;
 
 pub use check::{DisplayCheck, Verdict};
@@ -35,10 +36,10 @@ pub use find::{ConnectorList, SeenConnector};
 #[cfg(feature = "window")]
 pub(crate) use find::{SYS_CLASS_DRM, seen_connectors};
 pub use margin::CommitMargin;
+pub use target::DrmTarget;
 pub use timing::{FlipClock, FlipFaults, FlipStamp, Refresh};
 
 use std::os::fd::BorrowedFd;
-use std::path::PathBuf;
 
 use holod_calibration::{TimeNs, host_now};
 use rustix::io::Errno;
@@ -53,15 +54,6 @@ use seat::{Seat, Standing};
 
 /// A flip that has not come after this time never will.
 const FLIP_WAIT: TimeNs = TimeNs(500_000_000);
-
-/// A connector by name or monitor.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct DrmTarget {
-    /// A connector's name such as `DP-1`, or the name or serial number of the monitor at it.
-    pub connector: String,
-    /// The card, such as `/dev/dri/card1`, where the connector's name is not enough.
-    pub card: Option<PathBuf>,
-}
 
 /// A panel on a connector of a graphics card.
 ///
@@ -115,8 +107,7 @@ impl DrmPanel {
     pub fn open(target: &DrmTarget, setup: &PanelSetup) -> Result<Self, DrmError> {
         let layout = setup.flat.layout();
         let wanted = Wanted {
-            asked: target.connector.clone(),
-            card: target.card.clone(),
+            target: target.clone(),
             size: layout.video_resolution(),
             refresh_hz: setup.panel.refresh_hz,
             channel_bits: layout.packing.channel_bits(),
