@@ -18,7 +18,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use serde::Serialize;
 use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
-use tracing_subscriber::filter::Targets;
+use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 
@@ -62,7 +62,8 @@ pub fn start() -> io::Result<()> {
         .with_writer(|| ToStderr)
         .with_ansi(io::stderr().is_terminal())
         .with_target(false);
-    tracing_subscriber::registry().with(filter).with(lines).with(KeepRecent).init();
+    let kept = KeepRecent.with_filter(kept(&filter));
+    tracing_subscriber::registry().with(lines.with_filter(filter)).with(kept).init();
     if let Some(complaint) = complaint {
         tracing::warn!("{complaint}");
     }
@@ -133,6 +134,15 @@ pub fn filter(asked: Option<&str>) -> (Targets, Option<String>) {
     (directives.join(",").parse().expect("each directive is right"), complaint)
 }
 
+/// What the page and a record's file have: as much as standard error, and all from `info` up however quiet that is, since
+/// they say afterwards what happened.
+fn kept(filter: &Targets) -> Targets {
+    let at_least_info = |level: LevelFilter| level.max(LevelFilter::INFO);
+    let directives = filter.iter().map(|(target, level)| (target.to_owned(), at_least_info(level)));
+    let others = at_least_info(filter.default_level().unwrap_or(LevelFilter::INFO));
+    directives.collect::<Targets>().with_default(others)
+}
+
 /// A line of the log.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Line {
@@ -201,7 +211,7 @@ pub fn text_of(event: &Event<'_>) -> String {
     text.0
 }
 
-/// The file that takes every line that the filter lets through.
+/// The file that takes every line that is kept.
 static FILE: Mutex<Option<Arc<Outlet>>> = Mutex::new(None);
 
 /// The log goes into a file for as long as this lives.
@@ -312,7 +322,6 @@ pub fn recent_since(seen: &mut u64) -> Vec<Line> {
 mod tests {
     use super::*;
     use tracing_subscriber::Registry;
-    use tracing_subscriber::filter::LevelFilter;
 
     /// The lines that are kept are those of the whole process.
     static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
@@ -362,6 +371,23 @@ mod tests {
     fn most(asked: &str) -> (Option<LevelFilter>, bool) {
         let (filter, complaint) = filter(Some(asked));
         (Layer::<Registry>::max_level_hint(&filter), complaint.is_some())
+    }
+
+    #[test]
+    fn however_quiet_standard_error_is_what_happened_is_kept() {
+        let level = |asked: &str| Layer::<Registry>::max_level_hint(&kept(&filter(Some(asked)).0));
+        for (asked, most) in [
+            ("off", LevelFilter::INFO),
+            ("error", LevelFilter::INFO),
+            ("", LevelFilter::INFO),
+            ("holod_daemon=off", LevelFilter::INFO),
+            ("debug", LevelFilter::DEBUG),
+            ("warn,holod_daemon=trace", LevelFilter::TRACE),
+        ] {
+            assert_eq!(level(asked), Some(most), "{asked}");
+        }
+        let quiet = kept(&filter(Some("holod_daemon=off")).0);
+        assert!(quiet.would_enable("holod_daemon::run", &Level::INFO) && !quiet.would_enable("wgpu", &Level::DEBUG));
     }
 
     #[test]

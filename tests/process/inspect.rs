@@ -518,6 +518,18 @@ fn the_log_says_more_when_asked_and_a_typo_silences_nothing() {
 }
 
 #[test]
+fn a_silent_run_still_has_a_log_in_its_record() {
+    let folder = holod_tests::new_folder();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let run = ["--config", "rig.toml", "--tracker", "mock", "--resolution", "64x64", "--frames", "3"];
+    let args = [&run[..], &["--record", "record"]].concat();
+    let ended = Daemon::start_with(HOLOD, &args, folder.path(), &[("HOLOD_LOG", Path::new("off"))]).wait(PATIENCE);
+    assert!(ended.status.success() && ended.stderr.is_empty(), "{ended:?}");
+    let log = fs::read_to_string(folder.path().join("record/log.txt")).unwrap();
+    assert!(log.contains(" INFO ") && log.contains("holograms are computed by"), "{log}");
+}
+
+#[test]
 fn profiles_are_listed_with_what_they_are() {
     let folder = holod_tests::new_folder();
     let ended = run(HOLOD, &["tracker", "list", "--json"], folder.path());
