@@ -49,18 +49,19 @@ pub(super) fn read(path: &Path) -> Result<Vec<RecordedFrame>, Failure> {
     let wrong = |line: usize, what: &str| {
         Failure::new(Exit::Data, format!("frames.csv line {line}: {what}; ask for the report again"))
     };
-    let mut lines = BufReader::new(File::open(path).map_err(Failure::because(Exit::NoInput))?);
+    let file = File::open(path).map_err(|error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display())))?;
+    let mut lines = BufReader::new(file);
     let mut text = String::new();
-    let mut next = |text: &mut String| {
+    let mut next = |number: usize, text: &mut String| {
         text.clear();
-        (&mut lines).take(LONGEST_ROW).read_line(text).map_err(Failure::because(Exit::Data))
+        (&mut lines).take(LONGEST_ROW).read_line(text).map_err(|error| wrong(number, &error.to_string()))
     };
-    next(&mut text)?;
+    next(1, &mut text)?;
     let columns: HashMap<String, usize> =
         text.trim_end().split(',').enumerate().map(|(index, name)| (name.to_owned(), index)).collect();
     let mut frames: BTreeMap<u64, RecordedFrame> = BTreeMap::new();
     let mut number = 1;
-    while next(&mut text)? > 0 {
+    while next(number + 1, &mut text)? > 0 {
         number += 1;
         if text.len() as u64 == LONGEST_ROW {
             return Err(wrong(number, "found a row of more than 4 KiB, expected one of holod's"));
