@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use holod_calibration::rig::Tracker;
 use holod_daemon::failure::{Exit, Failure};
 use holod_pupil_input::{LogInfo, Recording};
 use numpy::PyArray1;
@@ -29,12 +30,12 @@ pub(crate) fn read_samples<'py>(
     path: PathBuf,
     scale_mm_per_unit: Option<f64>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    if let Some(scale) = scale_mm_per_unit.filter(|scale| !(*scale > 0.0 && scale.is_finite())) {
-        return Err(InputError::new_err(format!(
-            "scale_mm_per_unit: found {scale}, expected millimetres per unit of the log, a number above 0"
-        )));
+    if let Some(scale) = scale_mm_per_unit
+        && let Some(fault) = Tracker::scale_fault(scale)
+    {
+        return Err(InputError::new_err(format!("scale_mm_per_unit: found {scale}, {fault}")));
     }
-    let (columns, info, blinks) = without_lock(py, || {
+    let (columns, info, blinks, unit, scale) = without_lock(py, || {
         let recording = Recording::read(&path).map_err(Failure::because(Exit::Data))?;
         let mut columns = Columns::default();
         for sample in recording.samples() {
@@ -45,13 +46,15 @@ pub(crate) fn read_samples<'py>(
             columns.aperture_mm.push(sample.aperture_mm.unwrap_or(f32::NAN));
             columns.valid.push(sample.valid);
         }
-        let info = serde_json::to_string(&LogInfo::of(&recording, scale_mm_per_unit))
-            .map_err(Failure::because(Exit::Software))?;
+        let scale = scale_mm_per_unit.or(recording.recorded_scale());
+        let info = serde_json::to_string(&LogInfo::of(&recording, scale)).map_err(Failure::because(Exit::Software))?;
         let blinks: Vec<(String, i64, i64)> =
             recording.blinks().iter().map(|blink| (blink.eye.to_string(), blink.begins.0, blink.ends.0)).collect();
-        Ok((columns, info, blinks))
+        Ok((columns, info, blinks, recording.unit().name(), scale))
     })?;
     let read = PyDict::new(py);
+    read.set_item("unit", unit)?;
+    read.set_item("scale_mm_per_unit", scale)?;
     read.set_item("t_ns", PyArray1::from_vec(py, columns.t_ns))?;
     read.set_item("eye", PyArray1::from_vec(py, columns.eye))?;
     read.set_item("diameter", PyArray1::from_vec(py, columns.diameter))?;

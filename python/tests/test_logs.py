@@ -82,7 +82,9 @@ def test_a_log_in_another_unit_wants_a_scale(tmp_path: Path, log_file: Path) -> 
         _ = log.diameter_mm
     scaled = holod.read_log(path, scale_mm_per_unit=0.05)
     assert scaled.diameter_mm[0] == pytest.approx(0.175)
-    for scale in (0.0, -1.0, float("nan")):
+    assert (scaled.unit, scaled.diameter[0]) == ("camera pixels", pytest.approx(3.5))
+    # The last looks like micrometres.
+    for scale in (0.0, -1.0, float("nan"), 125.0):
         with pytest.raises(holod.InputError, match="scale_mm_per_unit: found"):
             holod.read_log(path, scale_mm_per_unit=scale)
 

@@ -42,7 +42,10 @@ class PupilLog:
     """those that the log itself tells"""
     info: dict[str, Any] = field(repr=False)
     """what `holod log info --json` says of the log, without the gate's word"""
+    unit: str
+    """of `diameter`: "mm", "camera pixels" or "arbitrary units" """
     scale_mm_per_unit: float | None
+    """given, or else the one that a recording of holod's began with"""
 
     @property
     def t_s(self) -> NDArray[np.float64]:
@@ -60,11 +63,6 @@ class PupilLog:
                 "disc of known diameter, or use `diameter`"
             )
         return self.diameter
-
-    @property
-    def unit(self) -> str:
-        """Of `diameter`: "mm", "camera pixels" or "arbitrary units"."""
-        return self.info["unit"]
 
     @property
     def format(self) -> str:
@@ -88,7 +86,8 @@ class PupilLog:
 def read_log(path: str | os.PathLike[str], *, scale_mm_per_unit: float | None = None) -> PupilLog:
     """Reads a log of any format that holod knows, told by its content.
 
-    `scale_mm_per_unit` is for logs that are not in millimetres: it changes `diameter_mm` and what `info` finds.
+    `scale_mm_per_unit` is for logs that are not in millimetres: it changes `diameter_mm` and what `info` finds. A
+    recording of holod's has the scale that its run began with, which is taken unless another is given.
 
     Raises InputError for a file that cannot be read, is of no known format, or holds no sample. Single bad lines are
     counted in `rejected`.
@@ -104,5 +103,6 @@ def read_log(path: str | os.PathLike[str], *, scale_mm_per_unit: float | None = 
         valid=read["valid"],
         blinks=[Blink(*blink) for blink in read["blinks"]],
         info=read["info"],
-        scale_mm_per_unit=scale_mm_per_unit,
+        unit=read["unit"],
+        scale_mm_per_unit=read["scale_mm_per_unit"],
     )
