@@ -56,7 +56,7 @@ impl FromStr for OutputSpec {
             "window" => window(rest).map(Self::Window),
             "headless" if !rest.starts_with(',') => report_faults(rest.trim_start_matches(':')).map(Self::Headless),
             "drm" => drm_target(rest.trim_start_matches(':')).map(Self::Drm),
-            _ => Err((format!("\"{kind}\""), Self::FORMS.to_owned())),
+            _ => Err((format!("\"{spec}\""), Self::FORMS.to_owned())),
         };
         parsed.map_err(|(found, expected)| SpecError { spec: spec.to_owned(), found, expected })
     }
@@ -217,6 +217,7 @@ mod tests {
     fn a_spec_that_names_no_panel_is_refused_in_words() {
         for (spec, part) in [
             ("screen", "found \"screen\"; expected headless"),
+            ("headless,late=0.1", "found \"headless,late=0.1\"; expected headless[:KEY"),
             ("headless:jitter", "found \"jitter\"; expected jitter=a time such as 0.2ms"),
             ("headless:late=2", "late=a share from 0 to 1"),
             ("headless:unplug=5s", "unplug=two times"),
