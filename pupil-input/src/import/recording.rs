@@ -77,6 +77,9 @@ const PART_SAMPLES: usize = 8;
 /// By how many samples one eye may be behind the other before the whole log is sorted.
 const EYES_OUT_OF_STEP: usize = 64;
 
+/// One sample in so many may go back without a word.
+const BACKWARDS_TOLD: u64 = 1000;
+
 /// Samples that are kept: 2.4 GB of them.
 const MOST_SAMPLES: usize = 100_000_000;
 /// A time beyond this, a hundred years from any origin, is no time; differences of two stay within i64.
@@ -162,7 +165,7 @@ impl LogBuilder {
     }
 
     fn reject_backwards(&mut self, line: u64) {
-        self.first_backwards.get_or_insert(line);
+        self.first_backwards = Some(self.first_backwards.map_or(line, |first| first.min(line)));
         self.count(LogFault::Backwards);
     }
 
@@ -253,11 +256,7 @@ impl LogBuilder {
         if self.headers.count > 0 {
             self.note(format!("its header comes again in {}: no row was made of that", self.headers));
         }
-        let backwards = self.faults.of(LogFault::Backwards);
-        if backwards * 2 > self.times {
-            let line = self.first_backwards.unwrap_or(0);
-            return Err(ReplayError::Unsorted { path: path.into(), backwards, rows: self.times, line });
-        }
+        self.judge_backwards(path)?;
         // Where nothing but faults made its samples, it holds none.
         if self.rows.len() <= self.lost_by_faults && self.rows.iter().all(|row| !row.valid) {
             let reasons = self.faults.entries().filter(|(_, count)| *count > 0);
@@ -304,6 +303,23 @@ impl LogBuilder {
         let warned = warnings.len();
         all.splice(0..0, warnings);
         Ok(Recording { format, unit, rows, blinks, faults, stated_rate_hz, recorded_scale, notes: all, warned })
+    }
+
+    /// Refuses a log most of which goes back, and warns of one of which more than a few samples do.
+    fn judge_backwards(&mut self, path: &Path) -> Result<(), ReplayError> {
+        let Some(line) = self.first_backwards else { return Ok(()) };
+        let (backwards, rows) = (self.faults.of(LogFault::Backwards), self.times);
+        if backwards * 2 > rows {
+            return Err(ReplayError::Unsorted { path: path.into(), backwards, rows, line });
+        }
+        if backwards * BACKWARDS_TOLD > rows {
+            self.warn(format!(
+                "{backwards} of {rows} samples are left out, whose times lie before those of the samples ahead of them, the \
+                 first in line {line}: were they written in another order than taken, or stamped late? Export the log \
+                 again, in order of time"
+            ));
+        }
+        Ok(())
     }
 
     /// Warns of where the clock began anew.
@@ -625,11 +641,28 @@ mod tests {
             let samples = part(0, 400, eye).chain(strays.iter().map(|t| stray(*t - 10))).chain(part(4000, 400, eye));
             let recording = read(samples);
             assert_eq!(times_ms(&recording, eye), (0..800).map(|k| 10 * k).collect::<Vec<_>>(), "{strays:?}");
-            assert_eq!((recording.faults().of(LogFault::Backwards), recording.notes().len()), (strays.len() as u64, 0));
+            assert_eq!(recording.faults().of(LogFault::Backwards), strays.len() as u64);
+            let told = format!("{} of {} samples are left out", strays.len(), 800 + strays.len());
+            let notes = recording.notes();
+            assert!(notes.len() == 1 && notes[0].contains(&told) && notes[0].contains("line 401"), "{notes:?}");
         }
         // Too few for a part, at the end.
         let recording = read(part(0, 400, eye).chain(part(0, 7, eye)));
         assert_eq!((recording.len(), recording.faults().of(LogFault::Backwards)), (400, 7));
+    }
+
+    #[test]
+    fn samples_that_go_back_are_told_where_they_are_more_than_one_in_a_thousand() {
+        let (left, right) = (SampleEye::Left, SampleEye::Right);
+        let stray = [sample(1, left)];
+        let of = |count| read(part(0, count, left).chain(stray));
+        let told = |recording: Recording| (recording.faults().of(LogFault::Backwards), recording.warnings().len());
+        assert_eq!([999, 998].map(|count| told(of(count))), [(1, 0), (1, 1)]);
+        // The first line of either eye, whichever is known to be wrong first.
+        let rights = part(0, 20, right).chain([sample(180 * MS, right)]).chain(part(200, 9, right));
+        let recording = read(part(0, 400, left).chain(part(0, 7, left)).chain(rights));
+        assert!(recording.warnings()[0].contains("8 of 437 samples"), "{:?}", recording.notes());
+        assert!(recording.warnings()[0].contains("the first in line 401"), "{:?}", recording.notes());
     }
 
     #[test]
