@@ -1,9 +1,10 @@
 //! XDF, the recordings of the Lab Streaming Layer (<https://github.com/sccn/xdf/wiki/Specifications>).
 //!
 //! After the four bytes `XDF:` come chunks: the number of bytes of their length (1, 4 or 8), the length, a tag of two
-//! bytes, the content; all little-endian. The file is read twice: once for the streams and their clock offsets, which
-//! come all along it, once for the samples.
+//! bytes, the content; all little-endian. The file is read twice: once for the streams, how many samples each has and
+//! their clock offsets, which come all along it, once for the samples.
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::io::{self, BufRead, Read};
 
@@ -14,6 +15,7 @@ use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
+use super::parts::is_restart;
 use super::recording::{LogBuilder, LogSample};
 use super::size::{ARBITRARY, MILLIMETRES, Measure, PIXELS, Said, Unit};
 use super::table::ns_of;
@@ -47,6 +49,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let mut streams = BTreeMap::new();
     let damage = for_chunks(input, |chunk| match chunk.tag {
         STREAM_HEADER => take_header(chunk, &mut streams, log),
+        SAMPLES => survey(chunk, &mut streams),
         CLOCK_OFFSET => take_offset(chunk, &mut streams),
         _ => Ok(()),
     })?;
@@ -56,7 +59,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         path: input.path.into(),
         at: String::new(),
         found,
-        expected: "a stream with a channel whose label or type tells of a pupil's diameter".into(),
+        expected: "a stream with samples and a channel whose label or type tells of a pupil's diameter".into(),
     })?;
     for stream in streams.values_mut() {
         stream.clock = Clocks::of(&std::mem::take(&mut stream.offsets));
@@ -76,6 +79,14 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         _ => Ok(()),
     })?;
     (0..damage.too_short).for_each(|_| log.count(LogFault::Wire(WireFault::TooShort)));
+    for stream in streams.values().filter(|stream| stream.moved > 0) {
+        log.note(format!(
+            "{} samples of {} have stamps before those of the samples ahead of them, as where a busy machine pushes them late: \
+             each was put 0.1 ms behind the one before it",
+            stream.moved,
+            stream.described()
+        ));
+    }
     Ok(())
 }
 
@@ -260,11 +271,75 @@ enum Channel {
         /// What makes a share of one of it.
         factor: f64,
     },
+    /// Whether the tracker found the pupil.
+    Validity {
+        eye: SampleEye,
+        label: String,
+        held: Bits,
+    },
+    /// The distance of the lids.
+    Aperture {
+        eye: SampleEye,
+        mm_per_unit: f64,
+    },
     /// A length that is said to be in units of area.
     Contradiction {
         label: String,
     },
     Other,
+}
+
+impl Channel {
+    const fn confidence_of(&self) -> Option<SampleEye> {
+        if let Self::Confidence { eye, .. } = self { Some(*eye) } else { None }
+    }
+
+    fn validity_of(&self) -> Option<SampleEye> {
+        match self {
+            Self::Validity { eye, held, .. } if held.fault().is_none() => Some(*eye),
+            _ => None,
+        }
+    }
+
+    const fn aperture_of(&self) -> Option<SampleEye> {
+        if let Self::Aperture { eye, .. } = self { Some(*eye) } else { None }
+    }
+}
+
+/// What a channel that should hold 0 and 1 holds.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Bits {
+    has_one: bool,
+    other: Option<f64>,
+}
+
+impl Bits {
+    /// NaN is what recorders write where there is no figure.
+    fn take(&mut self, figure: f64) {
+        if figure == 1.0 {
+            self.has_one = true;
+        } else if figure != 0.0 && !figure.is_nan() {
+            self.other.get_or_insert(figure);
+        }
+    }
+
+    /// Why it cannot be believed, if it cannot: it may be a code in which 0 is valid.
+    fn fault(self) -> Option<String> {
+        match self.other {
+            Some(figure) => Some(format!("it holds {figure}")),
+            None => (!self.has_one).then(|| "it is 0 throughout".into()),
+        }
+    }
+}
+
+/// Where a stream's rows hold one eye's figures.
+#[derive(Clone, Copy, Debug)]
+struct Taken {
+    eye: SampleEye,
+    size: usize,
+    confidence: Option<usize>,
+    validity: Option<usize>,
+    aperture: Option<usize>,
 }
 
 #[derive(Debug)]
@@ -278,10 +353,16 @@ struct Stream {
     one_eye_a_sample: bool,
     offsets: Vec<(f64, f64)>,
     clock: Clocks,
-    /// Index of the size, and of the confidence, of each eye that is taken from this stream.
-    taken: Vec<(SampleEye, usize, Option<usize>)>,
+    /// How many there are in the file.
+    samples: u64,
+    /// The eyes that are taken from this stream.
+    taken: Vec<Taken>,
     /// Time of the sample before, on the stream's own clock, seconds.
     latest_s: f64,
+    /// The latest time of a sample, as it was handed on.
+    latest: Option<TimeNs>,
+    /// Samples that were put behind it.
+    moved: u64,
     row: Vec<u8>,
 }
 
@@ -335,8 +416,11 @@ impl Stream {
             one_eye_a_sample,
             offsets: Vec::new(),
             clock: Clocks::default(),
+            samples: 0,
             taken: Vec::new(),
             latest_s: 0.0,
+            latest: None,
+            moved: 0,
             row: Vec::new(),
         })
     }
@@ -344,6 +428,15 @@ impl Stream {
     /// Its name and type, for notes.
     fn described(&self) -> String {
         format!("`{}` of type `{}`", self.name.escape_debug(), self.kind.escape_debug())
+    }
+
+    fn has_pupils(&self, is_wanted: impl Fn(SizeUnit) -> bool) -> bool {
+        let is_pupil = |channel: &Channel| matches!(channel, Channel::Size { unit, .. } if is_wanted(unit.unit));
+        self.figure != Figure::Text && self.channels.iter().any(is_pupil)
+    }
+
+    const fn row_bytes(&self) -> usize {
+        self.channels.len() * self.figure.bytes()
     }
 
     /// Takes the first size in `unit` of each eye that is not `known`: the eyes taken so far, each with its stream.
@@ -372,13 +465,14 @@ impl Stream {
                 doubts.push((label, measure.plural(), *doubt));
             }
             known.push((eye, id));
-            let confidence = |wanted| {
-                self.channels
-                    .iter()
-                    .position(|channel| matches!(channel, Channel::Confidence { eye, .. } if *eye == wanted))
+            let find = |eye_of: fn(&Channel) -> Option<SampleEye>| {
+                let of = |wanted| self.channels.iter().position(|channel| eye_of(channel) == Some(wanted));
+                of(eye).or_else(|| of(SampleEye::Both))
             };
-            self.taken.push((eye, size, confidence(eye).or_else(|| confidence(SampleEye::Both))));
+            let (confidence, validity) = (find(Channel::confidence_of), find(Channel::validity_of));
+            self.taken.push(Taken { eye, size, confidence, validity, aperture: find(Channel::aperture_of) });
         }
+        self.tell_validity(log);
         for (label, what, doubt) in doubts {
             log.warn(format!(
                 "the channel `{label}` of {} is taken for {what}, though {doubt}; where it is not, let its sender give it a \
@@ -392,6 +486,21 @@ impl Stream {
                 // Which of the two eyes each is, no label says.
                 SampleEye::Both => log.warn(format!("{found} pupil, too, and neither says of which eye it is")),
                 eye => log.note(format!("{found} {eye} eye, too")),
+            }
+        }
+    }
+
+    /// Warns of channels of validity that are not used.
+    fn tell_validity(&self, log: &mut LogBuilder) {
+        for channel in self.channels.iter().filter(|_| !self.taken.is_empty()) {
+            if let Channel::Validity { label, held, .. } = channel
+                && let Some(fault) = held.fault()
+            {
+                log.warn(format!(
+                    "the channel `{}` of {} is not used: {fault}; expected 1 where the pupil was found and 0 where it was not",
+                    label.escape_debug(),
+                    self.described()
+                ));
             }
         }
     }
@@ -431,6 +540,13 @@ fn channel(node: Node<'_, '_>) -> Channel {
         let factor = if matches!(unit.as_str(), "%" | "percent" | "per cent") { 0.01 } else { 1.0 };
         return Channel::Confidence { eye, factor };
     }
+    if says("valid") && says("pupil") && !says("invalid") {
+        return Channel::Validity { eye, label: written.to_owned(), held: Bits::default() };
+    }
+    if says("aperture") && !says("pupil") {
+        let length = Unit::named(&unit).filter(|unit| unit.unit == SizeUnit::Millimetres && !unit.is_squared);
+        return length.map_or(Channel::Other, |unit| Channel::Aperture { eye, mm_per_unit: unit.factor });
+    }
     // The width and height of the pupil's picture.
     if matches!(kind.as_str(), "diameterx" | "diametery") {
         return Channel::Other;
@@ -462,17 +578,10 @@ fn channel(node: Node<'_, '_>) -> Channel {
     Channel::Size { eye, measure, unit, label, doubt }
 }
 
-/// Says of which channels the samples are taken: the best unit that there is, and of each eye the first of it. On
-/// error, what streams there are.
+/// Says of which channels the samples are taken: the best unit that there are samples of, and of each eye the first of
+/// it in the stream of most samples. On error, what streams there are.
 fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(), String> {
     let units = [SizeUnit::Millimetres, SizeUnit::Pixels, SizeUnit::Arbitrary];
-    let has = |stream: &Stream, wanted: SizeUnit| {
-        stream.figure != Figure::Text
-            && stream
-                .channels
-                .iter()
-                .any(|channel| matches!(channel, Channel::Size { unit, .. } if unit.unit == wanted))
-    };
     for stream in streams.values() {
         for channel in &stream.channels {
             if let Channel::Contradiction { label } = channel {
@@ -484,21 +593,46 @@ fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(
             }
         }
     }
-    let Some(unit) = units.into_iter().find(|unit| streams.values().any(|stream| has(stream, *unit))) else {
-        let names: Vec<_> = streams.values().take(20).map(Stream::described).collect();
-        return Err(format!("no pupil among {} streams ({})", streams.len(), names.join(", ")));
+    let has = |wanted: &SizeUnit| {
+        streams.values().any(|stream| stream.samples > 0 && stream.has_pupils(|unit| unit == *wanted))
+    };
+    let Some(unit) = units.into_iter().find(has) else {
+        let names = |streams: &mut dyn Iterator<Item = &Stream>| {
+            streams.take(20).map(Stream::described).collect::<Vec<_>>().join(", ")
+        };
+        let of_pupils = names(&mut streams.values().filter(|stream| stream.has_pupils(|_| true)));
+        return Err(if of_pupils.is_empty() {
+            format!("no pupil among {} streams ({})", streams.len(), names(&mut streams.values()))
+        } else {
+            format!("no sample in the streams that have pupils ({of_pupils})")
+        });
     };
     log.unit = unit;
     let mut order: Vec<u32> = streams.keys().copied().collect();
-    order.sort_by_key(|id| streams[id].rank());
-    let (mut known, mut left_out) = (Vec::new(), Vec::new());
+    order.retain(|id| streams[id].samples > 0 || !streams[id].has_pupils(|_| true));
+    order.sort_by_key(|id| (streams[id].rank(), Reverse(streams[id].samples)));
+    let empty = streams.values().filter(|stream| stream.samples == 0 && stream.has_pupils(|_| true));
+    let mut left_out: Vec<_> = empty.map(|stream| format!("{} without a sample", stream.described())).collect();
+    let (mut known, mut has_pupils_alone) = (Vec::new(), false);
     for id in order {
         let Some(stream) = streams.get_mut(&id) else { continue };
         stream.take_sizes(id, unit, &mut known, log);
         if stream.taken.is_empty() {
-            left_out.push(stream.described());
+            // The relay's stream of gaze.
+            let repeats = has_pupils_alone && stream.one_eye_a_sample && stream.rank() > 0;
+            if stream.has_pupils(|_| true) && !repeats {
+                log.warn(format!(
+                    "the stream {} with pupils in {} samples is left out: pupils are read from another one, which is in a \
+                     better unit, has more samples or comes first; to read this one, record it without the other",
+                    stream.described(),
+                    stream.samples
+                ));
+            } else {
+                left_out.push(stream.described());
+            }
         } else {
-            let eyes: Vec<_> = stream.taken.iter().map(|taken| taken.0.to_string()).collect();
+            has_pupils_alone |= stream.rank() == 0;
+            let eyes: Vec<_> = stream.taken.iter().map(|taken| taken.eye.to_string()).collect();
             log.note(format!("read from the stream {}: {}", stream.described(), eyes.join(", ")));
             if stream.rate_hz > 0.0 {
                 log.stated_rate_hz.get_or_insert(stream.rate_hz);
@@ -657,6 +791,36 @@ impl Clock {
     }
 }
 
+/// Hands out the stamps, where there are any, and the figures of a chunk's samples.
+fn for_rows(chunk: &mut Chunk<'_>, row: &mut [u8], mut take: impl FnMut(Option<f64>, &[u8])) -> io::Result<()> {
+    let count = chunk.variable_length()?;
+    for _ in 0..count {
+        let stamp_s = match chunk.bytes()? {
+            [0] => None,
+            [8] => Some(f64::from_le_bytes(chunk.bytes()?)),
+            _ => return Err(io::ErrorKind::InvalidData.into()),
+        };
+        chunk.content.read_exact(row)?;
+        take(stamp_s, row);
+    }
+    Ok(())
+}
+
+/// Looks at a chunk of samples before it is known of which streams they are taken. What is wrong with it is counted when
+/// it is read.
+fn survey(chunk: &mut Chunk<'_>, streams: &mut BTreeMap<u32, Stream>) -> io::Result<()> {
+    let mut look = || {
+        let id = u32::from_le_bytes(chunk.bytes()?);
+        let Some(stream) = streams.get_mut(&id).filter(|stream| stream.has_pupils(|_| true)) else { return Ok(()) };
+        let mut row = vec![0; stream.row_bytes()];
+        for_rows(chunk, &mut row, |_, row| stream.survey(row))
+    };
+    match look() {
+        Err(error) if is_of_content(&error) => Ok(()),
+        looked => looked,
+    }
+}
+
 fn take_samples(
     chunk: &mut Chunk<'_>,
     streams: &mut BTreeMap<u32, Stream>,
@@ -665,37 +829,62 @@ fn take_samples(
 ) -> io::Result<()> {
     let id = u32::from_le_bytes(chunk.bytes()?);
     let Some(stream) = streams.get_mut(&id).filter(|stream| !stream.taken.is_empty()) else { return Ok(()) };
-    let count = chunk.variable_length()?;
     let mut row = std::mem::take(&mut stream.row);
-    row.resize(stream.channels.len() * stream.figure.bytes(), 0);
-    for _ in 0..count {
+    row.resize(stream.row_bytes(), 0);
+    let whole = for_rows(chunk, &mut row, |stamp_s, row| {
         *record += 1;
-        let t_s = match chunk.bytes::<1>() {
-            Ok([0]) => stream.latest_s + if stream.rate_hz > 0.0 { 1.0 / stream.rate_hz } else { 0.0 },
-            Ok([8]) => f64::from_le_bytes(chunk.bytes()?),
-            Ok(_) => return Err(io::ErrorKind::InvalidData.into()),
-            Err(error) => return Err(error),
-        };
-        chunk.content.read_exact(&mut row)?;
+        let interval_s = if stream.rate_hz > 0.0 { 1.0 / stream.rate_hz } else { 0.0 };
+        let t_s = stamp_s.unwrap_or(stream.latest_s + interval_s);
         stream.latest_s = t_s;
-        stream.push(t_s, &row, log, *record);
-    }
+        stream.push(t_s, row, log, *record);
+    });
     stream.row = row;
-    Ok(())
+    whole
 }
 
+/// By how much a sample is put behind the one whose stamp is later: less than the interval of any tracker, so that the
+/// stamps soon lead again.
+const BEHIND: TimeNs = TimeNs(100_000);
+
 impl Stream {
+    fn survey(&mut self, row: &[u8]) {
+        self.samples += 1;
+        let bytes = self.figure.bytes();
+        for (channel, figure) in self.channels.iter_mut().zip(row.chunks_exact(bytes)) {
+            if let Channel::Validity { held, .. } = channel {
+                held.take(self.figure.read(figure));
+            }
+        }
+    }
+
+    /// The time of a sample that is not before the latest. At a stated rate samples are pushed in their order, and stamps
+    /// that go back by less than a clock that begins anew are of a machine that was busy. The relay of Pupil Capture
+    /// interleaves two cameras, which run free of each other.
+    fn in_order(&mut self, mut t: TimeNs) -> TimeNs {
+        if let Some(latest) = self.latest
+            && t < latest
+            && self.rate_hz > 0.0
+            && !self.one_eye_a_sample
+            && !is_restart(latest.0, t.0)
+        {
+            self.moved += 1;
+            t = latest + BEHIND;
+        }
+        self.latest = Some(t);
+        t
+    }
+
     fn push(&mut self, t_s: f64, row: &[u8], log: &mut LogBuilder, record: u64) {
         if !t_s.is_finite() {
             return log.count(LogFault::BadNumber);
         }
         let t = match ns_of(t_s + self.clock.offset_s(t_s), 1e9) {
-            Ok(t) => TimeNs(t),
+            Ok(t) => self.in_order(TimeNs(t)),
             Err(fault) => return log.count(fault),
         };
         let bytes = self.figure.bytes();
         let figure = |index: usize| self.figure.read(&row[index * bytes..(index + 1) * bytes]);
-        for &(eye, size, confidence) in &self.taken {
+        for &Taken { eye, size, confidence, validity, aperture } in &self.taken {
             let Channel::Size { measure, unit, .. } = &self.channels[size] else { continue };
             let raw = figure(size);
             if raw.is_nan() && self.one_eye_a_sample {
@@ -703,7 +892,11 @@ impl Stream {
             }
             let diameter = (unit.factor * measure.diameter(raw)) as f32;
             // NaN, 0 and -1 are what recorders write of a pupil that was not found.
-            let valid = diameter.is_finite() && diameter > 0.0;
+            let valid = diameter.is_finite() && diameter > 0.0 && validity.is_none_or(|index| figure(index) == 1.0);
+            let aperture_mm = aperture.and_then(|index| match self.channels[index] {
+                Channel::Aperture { mm_per_unit, .. } => Some((mm_per_unit * figure(index)) as f32),
+                _ => None,
+            });
             let confidence = match confidence.map(|index| (&self.channels[index], figure(index))) {
                 None => 1.0,
                 Some((_, figure)) if figure.is_nan() => 0.0,
@@ -717,7 +910,7 @@ impl Stream {
                 Some(_) => continue,
             };
             let diameter = if valid { diameter } else { 0.0 };
-            log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, record);
+            log.push(LogSample { t, eye, diameter, confidence, aperture_mm, valid }, record);
         }
     }
 }

@@ -51,6 +51,10 @@ fn noted(recording: &Recording, words: &str) -> bool {
     recording.notes().iter().any(|note| note.contains(words))
 }
 
+fn warned(recording: &Recording, words: &str) -> bool {
+    recording.warnings().iter().any(|warning| warning.contains(words))
+}
+
 use SampleEye::{Both, Left, Right};
 
 // Tobii.
@@ -825,6 +829,121 @@ fn xdf_of_pupil_capture_reads_each_eye_in_its_turn() {
         recording.notes()
     );
     assert_eq!(samples(&read(gzip(xdf(&relay())))), samples(&recording));
+    // The stream of gaze repeats those pupils.
+    assert_eq!(recording.warnings(), [""; 0]);
+}
+
+#[test]
+fn xdf_takes_the_stream_of_most_samples_and_tells_which_it_leaves_out() {
+    let tracker = |id: u32, unit: &str, count: u32, size: f64| {
+        let pupils = [["left_pupil_diameter", "", "", unit], ["right_pupil_diameter", "", "", unit]];
+        let figures = [size, size];
+        let rows: Vec<_> = (0..count).map(|k| (Some(1.0 + 0.01 * f64::from(k)), &figures[..])).collect();
+        let header = stream_header(id, "Tobii", "Gaze", 100.0, "double64", &pupils);
+        if count == 0 { header } else { [header, doubles(id, &rows)].concat() }
+    };
+    for (units, counts, expected, told) in [
+        (["mm", "mm"], [0, 50], (50, 4.0), ""),
+        (["mm", "mm"], [50, 0], (50, 3.0), ""),
+        (["mm", "mm"], [20, 50], (50, 4.0), "with pupils in 20 samples"),
+        (["mm", "mm"], [50, 20], (50, 3.0), "with pupils in 20 samples"),
+        (["mm", "mm"], [50, 50], (50, 3.0), "with pupils in 50 samples"),
+        (["mm", "px"], [0, 50], (50, 4.0), ""),
+        (["px", "mm"], [50, 20], (20, 4.0), "with pupils in 50 samples"),
+    ] {
+        let recording = read(xdf(&[tracker(1, units[0], counts[0], 3.0), tracker(2, units[1], counts[1], 4.0)]));
+        let left = of_eye(&recording, Left);
+        assert_eq!((left.len(), left[0].1), (expected.0, Some(expected.1)), "{units:?}, {counts:?}");
+        assert_eq!(recording.warnings().len(), usize::from(!told.is_empty()), "{:?}", recording.notes());
+        assert!(recording.warnings().iter().all(|warning| warning.contains(told)), "{:?}", recording.notes());
+    }
+    let dir = TempDir::new().expect("a folder");
+    let empty = written(&dir, "log", xdf(&[tracker(1, "mm", 0, 3.0), tracker(2, "px", 0, 4.0)]));
+    let message = Recording::read(&empty).expect_err("no sample").to_string();
+    assert!(message.contains("no sample in the streams that have pupils (`Tobii` of type `Gaze`"), "{message}");
+}
+
+#[test]
+fn xdf_pupils_that_their_tracker_calls_invalid_are_lost() {
+    let of = |labels: [&str; 2], values: [f64; 3]| {
+        let channels = [[labels[0], "", "", "mm"], [labels[1], "", "", "mm"], ["left_pupil_validity", "", "", ""]];
+        let figures = values.map(|value| [3.5, 3.0, value]);
+        let rows: Vec<_> = (0..3_u8).map(|k| (Some(f64::from(k)), &figures[usize::from(k)][..])).collect();
+        read(xdf(&[stream_header(7, "Tobii", "Gaze", 0.0, "double64", &channels), doubles(7, &rows)]))
+    };
+    let names = ["left_pupil_diameter", "right_pupil_diameter"];
+    let valid =
+        |recording: &Recording, eye| -> Vec<_> { of_eye(recording, eye).iter().map(|row| row.1.is_some()).collect() };
+    for (lost, values) in [(1, [1.0, 0.0, 1.0]), (2, [1.0, 1.0, f64::NAN])] {
+        let recording = of(names, values);
+        assert_eq!(valid(&recording, Left), [0, 1, 2].map(|row| row != lost));
+        assert_eq!((valid(&recording, Right), recording.warnings()), (vec![true; 3], &[][..]));
+    }
+    // Codes of which 0 says that the eye was found; a channel that nobody fills in.
+    for (values, told) in [
+        ([0.0, 4.0, 0.0], "`left_pupil_validity` of `Tobii` of type `Gaze` is not used: it holds 4"),
+        ([1.0, 0.5, 0.0], "it holds 0.5"),
+        ([0.0, 0.0, 0.0], "it is 0 throughout"),
+    ] {
+        let recording = of(names, values);
+        assert_eq!(valid(&recording, Left), [true; 3], "{values:?}");
+        assert!(warned(&recording, told), "{:?}", recording.notes());
+    }
+}
+
+#[test]
+fn xdf_apertures_of_the_lids_are_read_where_they_have_a_unit_of_length() {
+    for (label, unit, figure, expected) in [
+        ("EyelidApertureLeft", "mm", 9.0, Some(9.0)),
+        ("eyelid aperture left", "cm", 0.75, Some(7.5)),
+        ("EyelidApertureLeft", "mm", f64::NAN, None),
+        ("EyelidApertureLeft", "", 9.0, None),
+        ("EyelidApertureLeft", "px", 9.0, None),
+        ("EyelidApertureRight", "mm", 9.0, None),
+    ] {
+        let channels = [["PupilDiameterLeft", "", "", "mm"], [label, "", "", unit]];
+        let rows = [(Some(1.0), &[3.5, figure][..])];
+        let recording = read(xdf(&[stream_header(7, "Neon", "Gaze", 0.0, "double64", &channels), doubles(7, &rows)]));
+        let apertures: Vec<_> = recording.samples().map(|sample| sample.aperture_mm).collect();
+        assert_eq!(apertures, [expected], "{label}, {unit}, {figure}");
+    }
+}
+
+#[test]
+fn xdf_samples_of_a_stated_rate_whose_stamps_jitter_back_are_kept_in_their_order() {
+    // Chunks of 20 samples at 1 kHz, of which each second one is stamped too early by `early_s`.
+    let of = |rate_hz: f64, early_s: f64| {
+        let mut chunks =
+            vec![stream_header(7, "EyeLink", "Gaze", rate_hz, "double64", &[["left_pupil_diameter", "", "", "mm"]])];
+        for chunk in 0..100_u32 {
+            let figures: Vec<_> = (0..20).map(|k| [3.0 + 1e-4 * f64::from(20 * chunk + k)]).collect();
+            let first_s = 100.0 + 0.02 * f64::from(chunk) - if chunk % 2 == 1 { early_s } else { 0.0 };
+            let stamp = |k: usize| Some(first_s + 1e-3 * k as f64);
+            let rows: Vec<_> = figures.iter().enumerate().map(|(k, figure)| (stamp(k), &figure[..])).collect();
+            chunks.push(doubles(7, &rows));
+        }
+        read(xdf(&chunks))
+    };
+    let recording = of(1000.0, 0.0053);
+    assert_eq!((recording.len(), recording.faults().total()), (2000, 0), "{:?}", recording.notes());
+    let left = of_eye(&recording, Left);
+    assert!(left.windows(2).all(|pair| pair[0].0 < pair[1].0 && pair[0].1 < pair[1].1));
+    // The latest is 4.3 ms ahead; each is put 0.1 ms behind the one before it until its own stamp is later: five of 50.
+    assert!(
+        recording.remarks().iter().any(|note| note.contains("250 samples of `EyeLink`")),
+        "{:?}",
+        recording.notes()
+    );
+    assert_eq!(recording.warnings(), [""; 0]);
+    let in_order = of(1000.0, 0.0);
+    assert!(!noted(&in_order, "0.1 ms"), "{:?}", in_order.notes());
+    // Without a rate they are dropped and told.
+    let recording = of(0.0, 0.0053);
+    assert_eq!(recording.faults().of(LogFault::Backwards), 250);
+    assert!(warned(&recording, "250 of 2000 samples are left out"), "{:?}", recording.notes());
+    // A clock that falls by a second and more has begun anew.
+    let recording = of(1000.0, 2.0);
+    assert!(warned(&recording, "begins anew"), "{:?}", recording.notes());
 }
 
 #[test]
