@@ -31,6 +31,8 @@ const EVENTS: &str = "physioevents";
 const SIDECAR_BYTES: u64 = 1 << 22;
 /// Folders in which a sidecar is looked for: session, subject, dataset and the like.
 const FOLDERS_UP: usize = 5;
+/// What columns of times are called: `timestamp` by the standard, and what is in use besides.
+const TIMES: [&str; 3] = ["timestamp", "timestamps", "time"];
 /// Rows that tell how much a unit of the time column is.
 const UNIT_ROWS: usize = 1000;
 
@@ -206,9 +208,21 @@ impl Sidecar {
         self.number("SamplingFrequency").filter(|rate| (1e-3..=1e6).contains(rate))
     }
 
+    /// The eye that it says, as the standard or as people write it.
+    fn stated_eye(&self) -> Option<SampleEye> {
+        let letters: String = self.text("RecordedEye")?.chars().filter(|letter| letter.is_alphanumeric()).collect();
+        let name = letters.to_lowercase();
+        let name = name.strip_suffix("eyes").or_else(|| name.strip_suffix("eye")).unwrap_or(&name);
+        Some(match name {
+            "left" | "l" => SampleEye::Left,
+            "right" | "r" => SampleEye::Right,
+            "cyclopean" | "both" | "binocular" => SampleEye::Both,
+            _ => return None,
+        })
+    }
+
     fn eye(&self) -> SampleEye {
-        let name = self.text("RecordedEye").map(str::to_lowercase);
-        name.and_then(|name| SampleEye::named(name.as_bytes())).unwrap_or(SampleEye::Both)
+        self.stated_eye().unwrap_or(SampleEye::Both)
     }
 }
 
@@ -256,7 +270,8 @@ struct Part {
 impl Part {
     fn new(path: PathBuf, sidecar: Sidecar) -> Result<Self, ReplayError> {
         let columns = sidecar.columns();
-        let time = columns.iter().position(|name| name.eq_ignore_ascii_case("timestamp"));
+        let named = |wanted: &str| columns.iter().position(|name| name.eq_ignore_ascii_case(wanted));
+        let time = TIMES.into_iter().find_map(named);
         let has = |name: &str, words: &[&str]| words.iter().any(|word| name.contains(word));
         let pupils: Vec<_> = columns
             .iter()
@@ -358,7 +373,33 @@ impl Part {
         Ok(ns)
     }
 
+    /// Warns of a sidecar that does not say of which eye a pupil is, and of a column that may hold the times.
+    fn tell_doubts(&self, log: &mut LogBuilder) {
+        let path = self.sidecar.path.display();
+        if self.sidecar.stated_eye().is_none() && self.eyes().any(|eye| eye == SampleEye::Both) {
+            let found = self.sidecar.fields.get("RecordedEye");
+            let found = found.map_or("no `RecordedEye`".into(), |eye| format!("the `RecordedEye` {eye}"));
+            log.warn(format!(
+                "{path}: {found}; its pupil is taken for that of both eyes; expected \"left\", \"right\" or \"cyclopean\""
+            ));
+        }
+        let may_be_time = |column: &&str| {
+            self.sidecar.of_column(column, "Units").and_then(ns_per_unit).is_some()
+                || column.to_lowercase().contains("time")
+        };
+        if self.time.is_none()
+            && let Some(column) = self.sidecar.columns().into_iter().find(may_be_time)
+        {
+            log.warn(format!(
+                "{path}: no column is called `timestamp`, so that rows are taken for one over the `SamplingFrequency` apart, \
+                 without pauses; is `{column}` their time? Then call it `timestamp` in `Columns`",
+                column = column.escape_debug()
+            ));
+        }
+    }
+
     fn read(&self, unit: SizeUnit, log: &mut LogBuilder) -> Result<(), ReplayError> {
+        self.tell_doubts(log);
         let rate_hz = self.sidecar.rate_hz();
         let ns_per_tick = self.time.map(|time| self.ns_per_tick(time, log)).transpose()?;
         let start_s = self.sidecar.number("StartTime").unwrap_or(0.0);
@@ -522,6 +563,19 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
                         path.display(),
                         eyes.join(", ")
                     ));
+                } else {
+                    let mut both =
+                        parts.iter().chain([&part]).filter(|part| part.eyes().any(|eye| eye == SampleEye::Both));
+                    let is_meant = both.all(|part| part.sidecar.stated_eye().is_some());
+                    let told = format!(
+                        "{} was left out: a pupil of both eyes adds nothing to one eye's, nor the other way round",
+                        path.display()
+                    );
+                    if is_meant {
+                        log.note(told);
+                    } else {
+                        log.warn(format!("{told}; give each file's sidecar its `RecordedEye`"));
+                    }
                 }
             }
         }

@@ -639,6 +639,107 @@ fn bids_times_that_fit_no_unit_by_the_stated_rate_are_told() {
 }
 
 #[test]
+fn bids_times_are_found_by_the_names_that_are_in_use_and_missed_ones_told() {
+    // A pause of 5 s behind the third row.
+    let table = "100\t3.5\n102\t3.6\n104\t3.7\n5106\t3.8\n";
+    let of = |columns: &str, more: &str| {
+        let sidecar = format!(
+            r#"{{"Columns": [{columns}], "SamplingFrequency": 500, "RecordedEye": "left",
+                "pupil_size": {{"Units": "mm", "Description": "Diameter"}}{more}}}"#
+        );
+        bids(&[("x_physio.tsv", table.as_bytes()), ("x_physio.json", sidecar.as_bytes())]).expect("reads")
+    };
+    for name in ["timestamp", "Timestamp", "timestamps", "TIME", "time"] {
+        let recording = of(&format!("\"{name}\", \"pupil_size\""), &format!(r#", "{name}": {{"Units": "ms"}}"#));
+        let times: Vec<_> = of_eye(&recording, Left).iter().map(|row| row.0 / MS).collect();
+        assert_eq!(times, [100, 102, 104, 5106], "{name}");
+        assert_eq!(recording.warnings(), [""; 0], "{name}");
+    }
+    for (name, unit, told) in [
+        ("clock", "ms", true),
+        ("frame_time", "", true),
+        ("EyeTime", "ticks", true),
+        ("x_coordinate", "pixel", false),
+        ("trigger", "", false),
+    ] {
+        let unit = format!(r#", "{name}": {{"Units": "{unit}"}}"#);
+        let recording = of(&format!("\"{name}\", \"pupil_size\""), &unit);
+        let times: Vec<_> = of_eye(&recording, Left).iter().map(|row| row.0 / MS).collect();
+        assert_eq!(times, [0, 2, 4, 6], "{name}");
+        let words = format!("is `{name}` their time?");
+        assert_eq!(recording.warnings().iter().any(|warning| warning.contains(&words)), told, "{name}");
+        assert_eq!(recording.warnings().is_empty(), !told, "{name}: {:?}", recording.notes());
+    }
+    // The standard's own name comes first.
+    let units = r#", "time": {"Units": "s"}, "timestamp": {"Units": "ms"}"#;
+    let sidecar = format!(
+        r#"{{"Columns": ["time", "timestamp", "pupil_size"], "SamplingFrequency": 500, "RecordedEye": "left",
+            "pupil_size": {{"Units": "mm"}}{units}}}"#
+    );
+    let table = "0\t100\t3.5\n0\t102\t3.6\n";
+    let recording = bids(&[("x_physio.tsv", table.as_bytes()), ("x_physio.json", sidecar.as_bytes())]).expect("reads");
+    assert_eq!(recording.begins(), TimeNs(100 * MS));
+}
+
+/// Two recordings of one row, 3.5 mm and 3 mm, whose sidecars say `eyes` as JSON, or nothing of the eye.
+fn bids_of_eyes(eyes: [Option<&str>; 2]) -> Recording {
+    let [first, second] = eyes.map(|eye| {
+        let eye = eye.map_or(String::new(), |eye| format!(r#""RecordedEye": {eye},"#));
+        format!(
+            r#"{{"Columns": ["timestamp", "pupil_diameter"], "SamplingFrequency": 500, {eye}
+                "timestamp": {{"Units": "ms"}}, "pupil_diameter": {{"Units": "mm"}}}}"#
+        )
+    });
+    bids(&[
+        ("x_recording-eye1_physio.tsv", b"0\t3.5\n"),
+        ("x_recording-eye1_physio.json", first.as_bytes()),
+        ("x_recording-eye2_physio.tsv", b"0\t3.0\n"),
+        ("x_recording-eye2_physio.json", second.as_bytes()),
+    ])
+    .expect("reads")
+}
+
+#[test]
+fn bids_eyes_are_understood_as_people_write_them() {
+    for (left, right) in
+        [("L", "R"), ("l", "r"), ("Left", "Right Eye"), ("left eye", "right-eye"), ("LEFT_EYE", "rightEye")]
+    {
+        let recording = bids_of_eyes([Some(&format!("{left:?}")), Some(&format!("{right:?}"))]);
+        assert_eq!(samples(&recording), [(0, Left, Some(3.5)), (0, Right, Some(3.0))], "{left}, {right}");
+        assert_eq!(recording.warnings(), [""; 0], "{left}, {right}");
+    }
+    // Of both eyes together, as the standard has it: the other file adds nothing, and that is no fault.
+    for both in ["cyclopean", "Both", "both eyes", "binocular"] {
+        let recording = bids_of_eyes([Some(&format!("{both:?}")), Some("\"left\"")]);
+        assert_eq!(samples(&recording), [(0, Both, Some(3.5))], "{both}");
+        assert_eq!(recording.warnings(), [""; 0], "{both}");
+        assert!(noted(&recording, "recording-eye2_physio.tsv was left out"), "{:?}", recording.notes());
+    }
+}
+
+#[test]
+fn a_bids_sidecar_that_does_not_say_which_eye_is_told_with_the_file_that_is_left_out_by_that() {
+    let left_out = "x_recording-eye2_physio.tsv was left out";
+    for (eyes, found) in [
+        ([None, None], "eye1_physio.json: no `RecordedEye`"),
+        ([Some("\"dominant\""), None], "eye1_physio.json: the `RecordedEye` \"dominant\""),
+        ([Some("[\"left\"]"), Some("\"right\"")], "eye1_physio.json: the `RecordedEye` [\"left\"]"),
+    ] {
+        let recording = bids_of_eyes(eyes);
+        assert_eq!(samples(&recording), [(0, Both, Some(3.5))], "{eyes:?}");
+        assert!(warned(&recording, found) && warned(&recording, left_out), "{eyes:?}: {:?}", recording.notes());
+    }
+    let recording = bids_of_eyes([Some("\"left\""), None]);
+    assert_eq!(samples(&recording), [(0, Left, Some(3.5))]);
+    assert!(warned(&recording, left_out), "{:?}", recording.notes());
+    // Where the columns say of which eye they are, nothing is missing.
+    let sidecar = r#"{"Columns": ["timestamp", "pupil_left", "pupil_right"], "SamplingFrequency": 500,
+        "timestamp": {"Units": "ms"}, "pupil_left": {"Units": "mm"}, "pupil_right": {"Units": "mm"}}"#;
+    let recording = bids(&[("x_physio.tsv", b"0\t3.5\t3.6\n"), ("x_physio.json", sidecar.as_bytes())]);
+    assert_eq!(recording.expect("reads").warnings(), [""; 0]);
+}
+
+#[test]
 fn a_bids_eye_that_is_left_out_is_told() {
     let sidecar = |eye: &str, unit: &str| {
         format!(
