@@ -52,12 +52,17 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let Some(clock) = choose_clock(input)? else { return Ok(()) };
     let Some(mut table) = Table::open(input, log, is_header)? else { return Ok(()) };
     let column = |wanted: &str| table.column(|name| name == wanted);
-    let has_millimetres = MILLIMETRES.iter().any(|(diameter, _, _)| column(diameter).is_some());
-    if !has_millimetres {
+    let in_mm = is_in_mm(input)?;
+    if !in_mm {
         log.unit = SizeUnit::Pixels;
+        if MILLIMETRES.iter().any(|(diameter, _, _)| column(diameter).is_some()) {
+            log.warn(
+                "`LPMM` and `RPMM`, the diameters in millimetres, are 0 throughout: sizes are those in pixels of the eye \
+                 camera; give the rig a scale",
+            );
+        }
     }
-    let eyes = if has_millimetres { MILLIMETRES } else { PIXELS }
-        .map(|(diameter, validity, eye)| column(diameter).map(|diameter| (diameter, column(validity), eye)));
+    let eyes = columns_of(&table, if in_mm { MILLIMETRES } else { PIXELS });
     let mut blinks = Blinks { id: column("BKID"), duration: column("BKDUR"), ..Blinks::default() };
     if let Some(begin) = table.names.iter().find_map(|name| name.strip_prefix("TIME(")?.strip_suffix(')')) {
         log.note(format!("the header says that it began at {}", begin.escape_debug()));
@@ -87,6 +92,37 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     }
     blinks.end(log);
     Ok(())
+}
+
+/// Column of the diameter, column of its validity, and eye.
+type Columns = (usize, Option<usize>, SampleEye);
+
+fn columns_of(table: &Table, names: [(&str, &str, SampleEye); 2]) -> [Option<Columns>; 2] {
+    let column = |wanted: &str| table.column(|name| name == wanted);
+    names.map(|(diameter, validity, eye)| column(diameter).map(|diameter| (diameter, column(validity), eye)))
+}
+
+/// Whether diameters are read in millimetres: where there are such columns, unless they are 0 throughout while pixels are
+/// not.
+fn is_in_mm(input: &LogInput<'_>) -> Result<bool, ReplayError> {
+    let mut ignored = LogBuilder::default();
+    let Some(mut table) = Table::open(input, &mut ignored, is_header)? else { return Ok(false) };
+    let [mm, px] = [MILLIMETRES, PIXELS].map(|names| columns_of(&table, names));
+    if [mm, px].iter().any(|eyes| eyes.iter().all(Option::is_none)) {
+        return Ok(mm.iter().any(Option::is_some));
+    }
+    let mut has_px = false;
+    while let Some(row) = table.next_row(&mut ignored) {
+        let holds = |eyes: [Option<Columns>; 2]| {
+            let is_size = |(diameter, validity, _)| figure(&row, diameter, validity).is_ok_and(|size| size > 0.0);
+            eyes.into_iter().flatten().any(is_size)
+        };
+        if holds(mm) {
+            return Ok(true);
+        }
+        has_px |= holds(px);
+    }
+    Ok(!has_px)
 }
 
 /// The tick clock where there is one that goes at its stated rate, since `TIME` starts again with each medium that was

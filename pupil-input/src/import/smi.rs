@@ -106,11 +106,37 @@ fn read_head(lines: &mut Lines, log: &mut LogBuilder) -> Option<(Header, Option<
     }
 }
 
+/// Whether sizes are read in millimetres: where there are such columns, unless they are 0 throughout while pixels are not.
+fn is_in_mm(input: &LogInput<'_>) -> Result<bool, ReplayError> {
+    let mut ignored = LogBuilder::default();
+    let mut lines = input.lines()?;
+    let Some((header, _)) = read_head(&mut lines, &mut ignored) else { return Ok(false) };
+    let [left_mm, right_mm] = EYES.map(|eye| header.first_of(&eye.diameter_mm));
+    let [left_px, right_px] = EYES.map(|eye| header.first_of(&eye.width_px));
+    if left_mm.or(right_mm).is_none() || left_px.or(right_px).is_none() {
+        return Ok(left_mm.or(right_mm).is_some());
+    }
+    let picker = Picker::new(header.separator, [header.column("Type"), left_mm, right_mm, left_px, right_px]);
+    let mut has_px = false;
+    while let Some(line) = lines.next(&mut ignored) {
+        let [kind, left_mm, right_mm, left_px, right_px] = picker.pick(line.bytes);
+        if kind.is_some_and(|kind| kind != b"SMP") {
+            continue;
+        }
+        let is_size = |cell: Option<&[u8]>| figure(cell).is_ok_and(|size| size > 0.0);
+        if is_size(left_mm) || is_size(right_mm) {
+            return Ok(true);
+        }
+        has_px |= is_size(left_px) || is_size(right_px);
+    }
+    Ok(!has_px)
+}
+
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let in_mm = is_in_mm(input)?;
     let mut lines = input.lines()?;
     let Some((header, stated_samples)) = read_head(&mut lines, log) else { return Ok(()) };
     let Some((time_column, places)) = times(&header) else { return Ok(()) };
-    let in_mm = EYES.iter().any(|eye| header.first_of(&eye.diameter_mm).is_some());
     let [left, right] = EYES.map(|eye| SizeColumns::of(&header, &eye, in_mm));
     let [left_event, right_event] = EYES.map(|eye| header.first_of(&eye.event));
     let columns = [
@@ -182,9 +208,20 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     }
     if !in_mm {
         log.unit = SizeUnit::Pixels;
-        log.note("there are no diameters in millimetres: sizes are in pixels of the eye camera, √(width·height)");
+        tell_pixels(&header, log);
     }
     Ok(())
+}
+
+fn tell_pixels(header: &Header, log: &mut LogBuilder) {
+    let in_pixels = "sizes are in pixels of the eye camera, √(width·height)";
+    if EYES.iter().any(|eye| header.first_of(&eye.diameter_mm).is_some()) {
+        log.warn(format!(
+            "the columns of diameters in millimetres are 0 or empty throughout: {in_pixels}; give the rig a scale"
+        ));
+    } else {
+        log.note(format!("there are no diameters in millimetres: {in_pixels}"));
+    }
 }
 
 /// The figure of a header line such as `## Sample Rate: 250`.

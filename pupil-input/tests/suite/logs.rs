@@ -694,6 +694,29 @@ fn smi_in_pixels_gives_the_disc_of_the_ellipse_and_counts_bad_rows() {
     assert_eq!(faults, [("log_malformed", 1), ("log_bad_number", 2), ("log_negative", 1)]);
 }
 
+#[test]
+fn smi_millimetres_that_are_all_0_give_way_to_pixels() {
+    let dir = TempDir::new().expect("a folder");
+    let log = |mm: fn(i32) -> &'static str, px: &str| {
+        let mut text = String::from("Time\tType\tTrial\tL Dia X [px]\tL Dia Y [px]\tL Pupil Diameter [mm]\n");
+        text.push_str("1000\tMSG\t1\t9\t9\t9\n");
+        for k in 0..100 {
+            writeln!(text, "{}\tSMP\t1\t{px}\t{px}\t{}", 2000 + 4000 * k, mm(k)).expect("a String takes all");
+        }
+        Recording::read(&written(&dir, "log", text)).expect("reads")
+    };
+    let first = |recording: &Recording| recording.samples().next().map(|sample| sample.diameter_mm);
+    let recording = log(|_| "0.00", "22.5");
+    assert_eq!((recording.unit(), recording.len(), first(&recording)), (SizeUnit::Pixels, 100, Some(22.5)));
+    let told = "the columns of diameters in millimetres are 0 or empty throughout";
+    assert!(recording.warnings().iter().any(|warning| warning.contains(told)), "{:?}", recording.notes());
+    // Millimetres that come late are no less what they are, and of an eye that was never seen there are no pixels either.
+    for recording in [log(|k| if k < 90 { "0.00" } else { "3.5" }, "22.5"), log(|_| "0.00", "0.00")] {
+        assert_eq!((recording.unit(), first(&recording)), (SizeUnit::Millimetres, Some(0.0)));
+        assert_eq!(recording.warnings(), [""; 0]);
+    }
+}
+
 /// BeGaze's raw data of two participants at 60 Hz: P01 for 20 s of 3 mm, P02 for 35 s of 5 mm.
 fn smi_of_two(participants: [&str; 2]) -> String {
     let mut text =

@@ -288,6 +288,29 @@ fn gazepoint_without_millimetres_or_ticks_reads_what_there_is() {
 }
 
 #[test]
+fn gazepoint_millimetres_that_are_all_0_give_way_to_pixels() {
+    let log = |lpmm: fn(i64) -> u8, lpd: &str| {
+        let mut text = String::from("CNT,TIME,LPD,LPV,RPD,RPV,LPMM,LPMMV,RPMM,RPMMV\n");
+        for row in 0..100 {
+            writeln!(text, "{row},{:.2},{lpd},1,21,1,{},1,0,0", row as f64 * 0.01, lpmm(row))
+                .expect("a String takes all");
+        }
+        read(text)
+    };
+    let recording = log(|_| 0, "22.5");
+    assert_eq!((recording.unit(), recording.len()), (SizeUnit::Pixels, 200));
+    assert_eq!((of_eye(&recording, Left)[0].1, of_eye(&recording, Right)[99].1), (Some(22.5), Some(21.0)));
+    assert!(warned(&recording, "`LPMM` and `RPMM`, the diameters in millimetres, are 0"), "{:?}", recording.notes());
+    // Millimetres that come late are no less what they are.
+    let recording = log(|row| if row < 90 { 0 } else { 4 }, "22.5");
+    assert_eq!((recording.unit(), of_eye(&recording, Left)[95].1), (SizeUnit::Millimetres, Some(4.0)));
+    assert_eq!(recording.warnings(), [""; 0]);
+    // Of an eye that was never seen there are no pixels either.
+    let recording = read("CNT,TIME,LPD,LPV,LPMM,LPMMV\n0,0.00,0,0,0,0\n1,0.01,0,0,0,0\n");
+    assert_eq!((recording.unit(), recording.warnings().len()), (SizeUnit::Millimetres, 0), "{:?}", recording.notes());
+}
+
+#[test]
 fn gazepoint_media_whose_time_starts_again_are_put_behind_with_their_blinks() {
     let mut text = String::from("MEDIA_ID,CNT,TIME,BKID,BKDUR,LPMM,LPMMV\n");
     for media in 0..7 {
