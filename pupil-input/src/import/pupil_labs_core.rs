@@ -96,6 +96,7 @@ fn each_row(
         header.column("diameter_3d"),
     ];
     let picker = Picker::new(header.separator, columns);
+    let mut of_neither: Option<(u64, String)> = None;
     while let Some(line) = lines.next(log) {
         if line.bytes.is_empty() {
             continue;
@@ -120,19 +121,32 @@ fn each_row(
             log.count(LogFault::Malformed);
             continue;
         };
-        let eye = match eye {
-            b"0" => SampleEye::Right,
-            b"1" => SampleEye::Left,
-            _ => {
-                log.count(LogFault::BadEye);
-                continue;
-            }
+        let Some(eye) = eye_of(eye) else {
+            log.count(LogFault::BadEye);
+            of_neither.get_or_insert_with(|| (line.number, String::from_utf8_lossy(eye).escape_debug().to_string()));
+            continue;
         };
         let method = method(name, diameter_mm);
         let diameter = if method == Method::TwoD { diameter_px } else { diameter_mm.unwrap_or_default() };
         take(log, &Row { line: line.number, t, eye, confidence, method, diameter });
     }
+    if let Some((line, found)) = of_neither {
+        log.warn(format!(
+            "{} rows are of neither eye: `eye_id` is `{found}` in line {line}, the first of them; expected 0 for the right \
+             eye or 1 for the left one; export the log again",
+            log.faults.of(LogFault::BadEye)
+        ));
+    }
     Ok(())
+}
+
+/// pandas makes 0.0 of 0 where a cell of the column was empty.
+fn eye_of(cell: &[u8]) -> Option<SampleEye> {
+    match number(cell)? {
+        0.0 => Some(SampleEye::Right),
+        1.0 => Some(SampleEye::Left),
+        _ => None,
+    }
 }
 
 /// How many rows there are, and from when to when.

@@ -360,6 +360,27 @@ fn an_eye_that_was_not_found_is_lost_however_its_confidence_is_written() {
 }
 
 #[test]
+fn core_eyes_are_read_as_pandas_writes_them_and_others_are_quoted() {
+    let dir = TempDir::new().expect("a folder");
+    let log = |rows: [&str; 4]| {
+        let header = "pupil_timestamp,eye_id,confidence,norm_pos_x,diameter,method,diameter_3d\n";
+        let rows: String = (1..).zip(rows).map(|(k, eye)| format!("1.{k},{eye},0.9,0,40,pye3d,3.5\n")).collect();
+        written(&dir, "log", format!("{header}{rows}"))
+    };
+    let (recording, info) = info(&log(["0.0", "1.0", "0", "1"]));
+    let (left, right) = (SampleEye::Left, SampleEye::Right);
+    assert_eq!(recording.samples().map(|sample| sample.eye).collect::<Vec<_>>(), [right, left, right, left]);
+    assert_eq!((recording.faults().total(), info.notes.len()), (0, 0), "{:?}", info.notes);
+    let recording = Recording::read(&log(["1", "left", "0.5", "0"])).expect("reads");
+    assert_eq!((recording.len(), recording.faults().of(LogFault::BadEye)), (2, 2));
+    let told =
+        "2 rows are of neither eye: `eye_id` is `left` in line 3, the first of them; expected 0 for the right eye";
+    assert!(recording.warnings()[0].contains(told), "{:?}", recording.notes());
+    let error = Recording::read(&log(["x\u{7}"; 4])).expect_err("no sample").to_string();
+    assert!(error.contains("log_bad_eye 4") && error.contains("`eye_id` is `x\\u{7}` in line 2"), "{error}");
+}
+
+#[test]
 fn confidence_in_per_cent_is_not_taken_for_certainty() {
     let header = "pupil_timestamp,eye_id,confidence,norm_pos_x,diameter,method,diameter_3d\n";
     let rows: String =
