@@ -16,8 +16,8 @@ pub enum ReplayError {
     #[error("pupil log {path} is {found}; expected a log file{hint}")]
     NotAFile { path: PathBuf, found: &'static str, hint: &'static str },
     /// Its beginning is of no known format.
-    #[error("pupil log {path}, line 1: found {found}; expected one of: {formats}; convert the log to one of these")]
-    UnknownFormat { path: PathBuf, found: String, formats: String },
+    #[error("pupil log {path}, line 1: found {found}; expected one of: {formats}; {advice}")]
+    UnknownFormat { path: PathBuf, found: String, formats: String, advice: &'static str },
     /// It is of a known format and wrong as a whole.
     #[error("pupil log {path}{at}: found {found}; expected {expected}")]
     Content {

@@ -84,9 +84,14 @@ impl Recording {
                 "what they were made of: play `tracker.holodraw` beside it again, or the log or scenario that the run had",
             ));
         }
-        let importer = IMPORTERS.iter().find(|importer| (importer.recognises)(&input)).ok_or_else(|| {
-            ReplayError::UnknownFormat { path: path.into(), found: beginning(&input), formats: known_formats() }
-        })?;
+        // First, since a log that is stored in an archive may be recognised behind the archive's own bytes.
+        if let Some((_, found, advice)) = RELATIVES.iter().find(|(begins, ..)| input.head.starts_with(begins)) {
+            return Err(unknown_format(path, (*found).into(), advice));
+        }
+        let importer = IMPORTERS
+            .iter()
+            .find(|importer| (importer.recognises)(&input))
+            .ok_or_else(|| unknown_format(path, beginning(&input), "convert the log to one of these"))?;
         let mut builder = LogBuilder::default();
         (importer.read)(&input, &mut builder)?;
         input.failed()?;
@@ -97,10 +102,16 @@ impl Recording {
     }
 }
 
-fn known_formats() -> String {
+fn unknown_format(path: &Path, found: String, advice: &'static str) -> ReplayError {
     let names: Vec<_> = IMPORTERS.iter().map(|importer| importer.format.name()).collect();
-    names.join(", ")
+    ReplayError::UnknownFormat { path: path.into(), found, formats: names.join(", "), advice }
 }
+
+/// How files begin that are no logs and of which logs can be made: what they are, and what makes a log of one.
+const RELATIVES: [(&[u8], &str, &str); 2] = [
+    (b"SR_RESEARCH_COMBINED_FILE_FORMAT", "an EyeLink EDF file", "convert it to `.asc` with SR Research's `edf2asc`"),
+    (b"PK\x03\x04", "a zip archive or a workbook", "unpack it, or export the sheet as CSV or TSV"),
+];
 
 /// How an unknown file begins, for people.
 fn beginning(input: &LogInput<'_>) -> String {

@@ -1,5 +1,5 @@
-//! A log's bytes as they should have been stored: unpacked from gzip and turned from UTF-16 into UTF-8, both told by
-//! their first bytes.
+//! A log's bytes as they should have been stored: unpacked from gzip and turned from UTF-16 into UTF-8, with and without
+//! a byte order mark, both told by their first bytes.
 
 use std::cell::Cell;
 use std::io::{self, BufRead, BufReader, Read};
@@ -95,7 +95,7 @@ impl<R: BufRead> Archive<R> {
 
 fn text(mut reader: BufReader<impl Read + 'static>) -> io::Result<Box<dyn BufRead>> {
     // A gzip member may begin with fewer bytes than a mark has: what was peeked at is put back in front.
-    let mut mark = [0; 3];
+    let mut mark = [0; UNMARKED_BYTES];
     let mut known = 0;
     while known < mark.len() {
         match reader.read(&mut mark[known..]) {
@@ -112,6 +112,8 @@ fn text(mut reader: BufReader<impl Read + 'static>) -> io::Result<Box<dyn BufRea
         (UTF16_LE_MARK.len(), Some(u16::from_le_bytes as fn([u8; 2]) -> u16))
     } else if begins.starts_with(UTF16_BE_MARK) {
         (UTF16_BE_MARK.len(), Some(u16::from_be_bytes as fn([u8; 2]) -> u16))
+    } else if is_unmarked_utf16(begins) {
+        (0, Some(u16::from_le_bytes as fn([u8; 2]) -> u16))
     } else {
         (0, None)
     };
@@ -123,6 +125,15 @@ fn text(mut reader: BufReader<impl Read + 'static>) -> io::Result<Box<dyn BufRea
             Utf16 { source: whole, unit, high: None, text: [0; 4], left: 0..0 },
         )),
     })
+}
+
+/// This many bytes tell UTF-16 without a mark: no text has a 0, and no binary log begins with so many of them.
+const UNMARKED_BYTES: usize = 8;
+
+/// Whether a log begins with ASCII of two bytes a letter, little-endian.
+fn is_unmarked_utf16(begins: &[u8]) -> bool {
+    let is_ascii = |unit: &[u8]| matches!(unit, [b'\t' | b'\r' | b'\n' | b' '..=b'~', 0]);
+    begins.len() == UNMARKED_BYTES && begins.chunks(2).all(is_ascii)
 }
 
 /// UTF-16 read as UTF-8; half a surrogate pair becomes U+FFFD, a last odd byte nothing.
@@ -218,6 +229,13 @@ mod tests {
         {
             assert_eq!(read(gzip(&bytes)).expect("reads"), text);
             assert_eq!(read(bytes).expect("reads"), text);
+        }
+        // Without a mark, where it begins in ASCII.
+        let unmarked = |text: &str| utf16(text, false).split_off(2);
+        assert_eq!(read(unmarked(text)).expect("reads"), text);
+        assert_eq!(read(gzip(&unmarked(text))).expect("reads"), text);
+        for other in [&b"T\0i\0m\0e"[..], b"T\0i\0\0\0e\0", b"T\0i\0\x01\0e\0", b"\0T\0i\0m\0e"] {
+            assert_eq!(read(other.to_vec()).expect("reads").as_bytes(), other);
         }
     }
 

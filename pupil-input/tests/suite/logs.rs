@@ -445,6 +445,21 @@ fn a_log_as_a_whole_is_refused_with_its_reason() {
         assert!(message.contains(told), "{message}");
     }
 
+    // What is no log itself, with what makes one of it.
+    for (content, found, advice) in [
+        (&b"SR_RESEARCH_COMBINED_FILE_FORMAT\0\0\x01"[..], "an EyeLink EDF file", "with SR Research's `edf2asc`"),
+        (
+            // Not packed, so that its log shows.
+            b"PK\x03\x04\x14\0\0\0a.csv,timestamp [ns],pupil diameter left [mm]\n0,1000000,3.5\n0,2000000,3.5\n",
+            "a zip archive or a workbook",
+            "unpack it, or export the sheet as CSV or TSV",
+        ),
+        (b"time;pupil\n1;2\n", "`time;pupil`", "convert the log to one of these"),
+    ] {
+        let message = refused(&written(&dir, "log", content)).to_string();
+        assert!(message.contains(&format!("found {found};")) && message.ends_with(advice), "{message}");
+    }
+
     assert!(refused(&written(&dir, "empty", "")).to_string().contains("an empty file"));
     assert!(refused(dir.path()).to_string().contains("is a directory"));
     assert!(refused(Path::new("/dev/null")).to_string().contains("device"));
