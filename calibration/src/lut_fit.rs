@@ -91,13 +91,10 @@ pub enum LutFitError {
     RunsBack { before: u16, after: u16 },
     /// Powers of a meter that is too coarse, or of anything else.
     #[error(
-        "the powers are those of no fringe: the nearest one has {stroke_pi:.3} π at the top level, expected {STROKE_MAX_PI} at \
-         most, and misses them by {percent:.0} % of its height (rms), expected {most:.0} at most; look whether the meter \
-         resolves a hundredth of the fringe, and average more readings",
-        percent = 1e2 * residual,
-        most = 1e2 * RESIDUAL_MAX
+        "the powers are those of no fringe: {found}; look whether the meter resolves a hundredth of the fringe, and \
+         average more readings"
     )]
-    NoFringe { stroke_pi: f64, residual: f64 },
+    NoFringe { found: String },
 }
 
 /// Reads the phase of each level of a panel with `levels` of them back from a sweep, rows in the order of levels, the
@@ -123,10 +120,8 @@ pub fn fit(rows: &[LevelPower], levels: usize) -> Result<LutFit, LutFitError> {
     }
     let residual = (curve.left / rows.len() as f64).sqrt() / curve.height;
     let stroke_pi = curve.phases_rad[rows.len() - 1] / PI;
-    // Neither may be a number.
-    let is_fringe = stroke_pi <= STROKE_MAX_PI && (0.0..=RESIDUAL_MAX).contains(&residual);
-    if !is_fringe {
-        return Err(LutFitError::NoFringe { stroke_pi, residual });
+    if let Some(found) = misfit(stroke_pi, residual) {
+        return Err(LutFitError::NoFringe { found });
     }
     let phases_rad: Vec<f64> = (0..levels).map(|level| between(rows, &curve.phases_rad, level as u16)).collect();
     let turns = (1..).map(|turn| phases_rad.partition_point(|&phase_rad| phase_rad < f64::from(turn) * PI));
@@ -136,6 +131,20 @@ pub fn fit(rows: &[LevelPower], levels: usize) -> Result<LutFit, LutFitError> {
         residual,
         background: curve.floor / curve.height,
     })
+}
+
+/// What keeps the nearest fringe from being that of the powers, if anything does.
+fn misfit(stroke_pi: f64, residual: f64) -> Option<String> {
+    if !(stroke_pi.is_finite() && residual.is_finite()) {
+        return Some("none comes near them".into());
+    }
+    if stroke_pi > STROKE_MAX_PI {
+        return Some(format!("the nearest one goes up to {stroke_pi:.3} π, expected {STROKE_MAX_PI} π at most"));
+    }
+    let [found, most] = [residual.abs(), RESIDUAL_MAX].map(|share| 1e2 * share);
+    let says =
+        format!("they differ from the nearest one's by {found:.0} % of its height (rms), expected {most:.0} % at most");
+    (!(0.0..=RESIDUAL_MAX).contains(&residual)).then_some(says)
 }
 
 /// A curve of phases, and the fringe that it makes.
