@@ -141,10 +141,13 @@ fn misfit(stroke_pi: f64, residual: f64) -> Option<String> {
     if stroke_pi > STROKE_MAX_PI {
         return Some(format!("the nearest one goes up to {stroke_pi:.3} π, expected {STROKE_MAX_PI} π at most"));
     }
-    let [found, most] = [residual.abs(), RESIDUAL_MAX].map(|share| 1e2 * share);
-    let says =
-        format!("they differ from the nearest one's by {found:.0} % of its height (rms), expected {most:.0} % at most");
-    (!(0.0..=RESIDUAL_MAX).contains(&residual)).then_some(says)
+    if residual < 0.0 {
+        return Some("the nearest one is upside down".into());
+    }
+    let [found, most] = [residual, RESIDUAL_MAX].map(|share| 1e2 * share);
+    (residual > RESIDUAL_MAX).then(|| {
+        format!("they differ from the nearest one's by {found:.1} % of its height (rms), expected {most:.0} % at most")
+    })
 }
 
 /// A curve of phases, and the fringe that it makes.
@@ -426,6 +429,21 @@ mod tests {
                 assert!(fit.phases_rad.is_sorted_by(|a, b| a < b) && fit.phases_rad[0] == 0.0, "{case}");
             }
         }
+    }
+
+    #[test]
+    fn what_keeps_a_fringe_from_being_the_powers_own_is_told() {
+        for (stroke_pi, residual, says) in [
+            (f64::NAN, 0.1, "none comes near them"),
+            (2.0, f64::INFINITY, "none comes near them"),
+            (6.5, 0.01, "up to 6.500 π, expected 6 π at most"),
+            (2.0, -0.03, "upside down"),
+            (2.0, 0.153, "by 15.3 % of its height (rms), expected 15 % at most"),
+        ] {
+            let told = misfit(stroke_pi, residual);
+            assert!(told.as_ref().is_some_and(|told| told.contains(says)), "{stroke_pi} π, {residual}: {told:?}");
+        }
+        assert_eq!(misfit(STROKE_MAX_PI, RESIDUAL_MAX), None);
     }
 
     #[test]

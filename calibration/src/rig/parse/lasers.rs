@@ -151,9 +151,9 @@ fn check_window(lasers: &Section<'_>, timing: FieldTiming, on_delay_ms: f64, lit
 }
 
 fn check_heartbeat(timing: FieldTiming, heartbeat_ms: &Found<'_, f64>) {
-    let least_ms = 2.0 * timing.colour_frame_ms();
+    let least_ms = shown(2.0 * timing.colour_frame_ms());
     if heartbeat_ms.value < least_ms {
-        let expected = format!("at least two colour frames, {} ms", shown(least_ms));
+        let expected = format!("at least two colour frames, {least_ms} ms");
         let advice = "lengthen it, or the box goes dark between two frames";
         let found = format!("{} ms", heartbeat_ms.value);
         heartbeat_ms.fault(&found, &expected, advice);
@@ -161,9 +161,9 @@ fn check_heartbeat(timing: FieldTiming, heartbeat_ms: &Found<'_, f64>) {
 }
 
 fn check_stall(timing: FieldTiming, stall_ms: &Found<'_, f64>) {
-    let least_ms = timing.colour_frame_ms();
+    let least_ms = shown(timing.colour_frame_ms());
     if stall_ms.value < least_ms {
-        let expected = format!("at least one colour frame, {} ms", shown(least_ms));
+        let expected = format!("at least one colour frame, {least_ms} ms");
         let advice = "lengthen it, or the last colour of each frame stays dark";
         stall_ms.fault(format!("{} ms", stall_ms.value), &expected, advice);
     }
