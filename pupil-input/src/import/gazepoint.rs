@@ -102,8 +102,8 @@ fn columns_of(table: &Table, names: [(&str, &str, SampleEye); 2]) -> [Option<Col
     names.map(|(diameter, validity, eye)| column(diameter).map(|diameter| (diameter, column(validity), eye)))
 }
 
-/// Whether diameters are read in millimetres: where there are such columns, unless they are 0 throughout while pixels are
-/// not.
+/// Whether diameters are read in millimetres: where there are such columns, unless they are 0 throughout while pixels
+/// are not.
 fn is_in_mm(input: &LogInput<'_>) -> Result<bool, ReplayError> {
     let mut ignored = LogBuilder::default();
     let Some(mut table) = Table::open(input, &mut ignored, is_header)? else { return Ok(false) };

@@ -315,8 +315,8 @@ impl LogBuilder {
         if backwards * BACKWARDS_TOLD > rows {
             self.warn(format!(
                 "{backwards} of {rows} samples are left out, whose times lie before those of the samples ahead of them, the \
-                 first in line {line}: were they written in another order than taken, or stamped late? Export the log \
-                 again, in order of time"
+                 first in line or sample {line}: were they written in another order than taken, or stamped late? Export \
+                 or record them again, in order of time"
             ));
         }
         Ok(())
@@ -644,7 +644,10 @@ mod tests {
             assert_eq!(recording.faults().of(LogFault::Backwards), strays.len() as u64);
             let told = format!("{} of {} samples are left out", strays.len(), 800 + strays.len());
             let notes = recording.notes();
-            assert!(notes.len() == 1 && notes[0].contains(&told) && notes[0].contains("line 401"), "{notes:?}");
+            assert!(
+                notes.len() == 1 && notes[0].contains(&told) && notes[0].contains("line or sample 401"),
+                "{notes:?}"
+            );
         }
         // Too few for a part, at the end.
         let recording = read(part(0, 400, eye).chain(part(0, 7, eye)));
@@ -662,7 +665,7 @@ mod tests {
         let rights = part(0, 20, right).chain([sample(180 * MS, right)]).chain(part(200, 9, right));
         let recording = read(part(0, 400, left).chain(part(0, 7, left)).chain(rights));
         assert!(recording.warnings()[0].contains("8 of 437 samples"), "{:?}", recording.notes());
-        assert!(recording.warnings()[0].contains("the first in line 401"), "{:?}", recording.notes());
+        assert!(recording.warnings()[0].contains("the first in line or sample 401"), "{:?}", recording.notes());
     }
 
     #[test]

@@ -106,7 +106,8 @@ fn read_head(lines: &mut Lines, log: &mut LogBuilder) -> Option<(Header, Option<
     }
 }
 
-/// Whether sizes are read in millimetres: where there are such columns, unless they are 0 throughout while pixels are not.
+/// Whether sizes are read in millimetres: where there are such columns, unless they are 0 throughout while pixels are
+/// not.
 fn is_in_mm(input: &LogInput<'_>) -> Result<bool, ReplayError> {
     let mut ignored = LogBuilder::default();
     let mut lines = input.lines()?;

@@ -1,5 +1,5 @@
-//! A log's bytes as they should have been stored: unpacked from gzip and turned from UTF-16 into UTF-8, with and without
-//! a byte order mark, both told by their first bytes.
+//! A log's bytes as they should have been stored: unpacked from gzip and turned from UTF-16 into UTF-8, with and
+//! without a byte order mark, both told by their first bytes.
 
 use std::cell::Cell;
 use std::io::{self, BufRead, BufReader, Read};

@@ -15,7 +15,6 @@ use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
-use super::parts::is_restart;
 use super::recording::{LogBuilder, LogSample};
 use super::size::{ARBITRARY, MILLIMETRES, Measure, PIXELS, Said, Unit};
 use super::table::ns_of;
@@ -806,8 +805,8 @@ fn for_rows(chunk: &mut Chunk<'_>, row: &mut [u8], mut take: impl FnMut(Option<f
     Ok(())
 }
 
-/// Looks at a chunk of samples before it is known of which streams they are taken. What is wrong with it is counted when
-/// it is read.
+/// Looks at a chunk of samples before it is known of which streams they are taken. What is wrong with it is counted
+/// when it is read.
 fn survey(chunk: &mut Chunk<'_>, streams: &mut BTreeMap<u32, Stream>) -> io::Result<()> {
     let mut look = || {
         let id = u32::from_le_bytes(chunk.bytes()?);
@@ -842,9 +841,11 @@ fn take_samples(
     whole
 }
 
-/// By how much a sample is put behind the one whose stamp is later: less than the interval of any tracker, so that the
-/// stamps soon lead again.
+/// By how much a sample is put behind the one whose stamp is later: less than any tracker's interval, so that stamps
+/// soon lead again.
 const BEHIND: TimeNs = TimeNs(100_000);
+/// A stamp that is later than the next one by more is wrong itself, and no sample is put behind it.
+const LATE_MOST: TimeNs = TimeNs(50_000_000);
 
 impl Stream {
     fn survey(&mut self, row: &[u8]) {
@@ -857,15 +858,15 @@ impl Stream {
         }
     }
 
-    /// The time of a sample that is not before the latest. At a stated rate samples are pushed in their order, and stamps
-    /// that go back by less than a clock that begins anew are of a machine that was busy. The relay of Pupil Capture
-    /// interleaves two cameras, which run free of each other.
+    /// The time of a sample, which at a stated rate is not before the latest where that is late by a busy machine's
+    /// delay: samples are pushed in their order. The relay of Pupil Capture interleaves two cameras, which run free of
+    /// each other.
     fn in_order(&mut self, mut t: TimeNs) -> TimeNs {
         if let Some(latest) = self.latest
             && t < latest
             && self.rate_hz > 0.0
             && !self.one_eye_a_sample
-            && !is_restart(latest.0, t.0)
+            && (latest - t).0 <= LATE_MOST.0
         {
             self.moved += 1;
             t = latest + BEHIND;

@@ -746,7 +746,7 @@ fn smi_millimetres_that_are_all_0_give_way_to_pixels() {
     assert_eq!((recording.unit(), recording.len(), first(&recording)), (SizeUnit::Pixels, 100, Some(22.5)));
     let told = "the columns of diameters in millimetres are 0 or empty throughout";
     assert!(recording.warnings().iter().any(|warning| warning.contains(told)), "{:?}", recording.notes());
-    // Millimetres that come late are no less what they are, and of an eye that was never seen there are no pixels either.
+    // Millimetres that come late are no less what they are; of an eye that was never seen there are no pixels either.
     for recording in [log(|k| if k < 90 { "0.00" } else { "3.5" }, "22.5"), log(|_| "0.00", "0.00")] {
         assert_eq!((recording.unit(), first(&recording)), (SizeUnit::Millimetres, Some(0.0)));
         assert_eq!(recording.warnings(), [""; 0]);

@@ -1065,6 +1065,9 @@ fn xdf_samples_of_a_stated_rate_whose_stamps_jitter_back_are_kept_in_their_order
     let recording = of(0.0, 0.0053);
     assert_eq!(recording.faults().of(LogFault::Backwards), 250);
     assert!(warned(&recording, "250 of 2000 samples are left out"), "{:?}", recording.notes());
+    // No machine is busy for that long: nothing is squeezed in behind a stamp that is wrong.
+    let recording = of(1000.0, 0.2);
+    assert!(!noted(&recording, "0.1 ms") && warned(&recording, "are left out"), "{:?}", recording.notes());
     // A clock that falls by a second and more has begun anew.
     let recording = of(1000.0, 2.0);
     assert!(warned(&recording, "begins anew"), "{:?}", recording.notes());
