@@ -134,8 +134,8 @@ pub fn filter(asked: Option<&str>) -> (Targets, Option<String>) {
     (directives.join(",").parse().expect("each directive is right"), complaint)
 }
 
-/// What the page and a record's file have: as much as standard error, and all from `info` up however quiet that is, since
-/// they say afterwards what happened.
+/// What the page and a record's file have: as much as standard error, and all from `info` up however quiet that is,
+/// since they say afterwards what happened.
 fn kept(filter: &Targets) -> Targets {
     let at_least_info = |level: LevelFilter| level.max(LevelFilter::INFO);
     let directives = filter.iter().map(|(target, level)| (target.to_owned(), at_least_info(level)));

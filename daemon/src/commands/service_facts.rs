@@ -14,11 +14,17 @@ pub(super) const STATE_FOLDER: &str = "/var/lib/holod";
 /// What the unit hides (`ProtectHome=`, `PrivateTmp=`).
 const HIDDEN_FROM_SERVICE: [&str; 5] = ["/home", "/root", "/run/user", "/tmp", "/var/tmp"];
 
-/// The hidden folder that a file is in, by its name or by where links and `..` lead from there.
-pub(super) fn hidden_from_service(file: &Path) -> Option<&'static str> {
-    let leads_to = file.canonicalize().unwrap_or_else(|_| file.to_owned());
-    let is_in = |folder: &&str| file.starts_with(folder) || leads_to.starts_with(folder);
-    HIDDEN_FROM_SERVICE.into_iter().find(is_in)
+/// Why the service does not see a file, if it does not: by its name, or by where links and `..` lead from there.
+pub(super) fn unseen_by_service(file: &Path) -> Option<String> {
+    let shown = file.display();
+    let in_one = |path: &Path| HIDDEN_FROM_SERVICE.into_iter().find(|folder| path.starts_with(folder));
+    if let Some(folder) = in_one(file) {
+        return Some(format!("{shown}; the service does not see {folder}, move it to /etc/holod or /srv"));
+    }
+    let folder = in_one(&file.canonicalize().ok()?)?;
+    Some(format!(
+        "{shown}, which leads into {folder}; the service does not see that, put the file itself into /etc/holod or /srv"
+    ))
 }
 
 /// An absolute path in a machine whose `/` is the folder `root`.

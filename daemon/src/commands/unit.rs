@@ -12,7 +12,7 @@ use holod_slm_output::OutputSpec;
 use holod_slm_output::present::drm::DrmTarget;
 
 use super::run;
-use super::service_facts::{BINARY, STATE_FOLDER, USUAL_RIG, below, files_of, hidden_from_service};
+use super::service_facts::{BINARY, STATE_FOLDER, USUAL_RIG, below, files_of, unseen_by_service};
 use crate::cli::{PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
 use crate::source::feed_socket;
@@ -350,18 +350,10 @@ fn visible(what: &str, path: &Path) -> Result<(), Failure> {
     if !path.is_absolute() {
         return refused(format!("{what}: found {shown}; the service starts in /, write the whole path"));
     }
-    match hidden_from_service(path) {
-        Some(folder) => {
-            let leads = if path.starts_with(folder) { "" } else { ", which leads there" };
-            refused(format!(
-                "{what}: found {shown}{leads}; the service does not see {folder}, move it to /etc/holod or /srv"
-            ))
-        }
-        None => Ok(()),
-    }
+    unseen_by_service(path).map_or(Ok(()), |why| refused(format!("{what}: found {why}")))
 }
 
-/// Whether a path is elsewhere than it begins.
+/// Whether a path has a `..`, and so may leave the folder that it begins with.
 fn goes_up(path: &Path) -> bool {
     path.components().any(|part| part == Component::ParentDir)
 }
@@ -503,7 +495,7 @@ mod tests {
         let refused = |words: &[&str]| drop_in_of(words, &rig(), root.path()).unwrap_err();
         let by_link = refused(&["--config", link.to_str().unwrap()]);
         fs::remove_file(&link).unwrap();
-        assert!(by_link.contains("which leads there; the service does not see /tmp"), "{by_link}");
+        assert!(by_link.contains("which leads into /tmp; the service does not see that"), "{by_link}");
         let up = refused(&[&RIG[..], &["--record-in", "/var/lib/holod/../runs"]].concat());
         assert!(up.contains("/var/lib/holod only"), "{up}");
         let socket = refused(&[&RIG[..], &["--page", "unix:/var/lib/holod/../x"]].concat());

@@ -11,7 +11,7 @@ use rustix::fs::Access;
 use rustix::process::{Resource, getrlimit};
 
 use super::Check;
-use crate::commands::service_facts::{files_of, hidden_from_service};
+use crate::commands::service_facts::{files_of, unseen_by_service};
 use crate::scheduling;
 
 const SERVICE_USER: &str = "holod";
@@ -98,10 +98,8 @@ fn files(rig: &Rig, runner: &Runner) -> Result<String, Vec<String>> {
     let mut faults = Vec::new();
     for file in &files {
         let shown = file.display();
-        match (runner, hidden_from_service(file)) {
-            (Runner::Service { .. }, Some(folder)) => {
-                faults.push(format!("{shown}: the service does not see {folder}: move it to /etc/holod or /srv"));
-            }
+        match (runner, unseen_by_service(file)) {
+            (Runner::Service { .. }, Some(why)) => faults.push(why),
             _ if matches!(file.metadata(), Err(error) if error.kind() == ErrorKind::NotFound) => {
                 faults.push(format!("there is no {shown}: correct its path"));
             }
